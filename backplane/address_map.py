@@ -46,7 +46,8 @@ class Window:
 
 class AddressMap:
     """Addresses of everything on one backplane; `size` is their total in bytes, without the
-    texts."""
+    texts.
+    """
 
     def __init__(self, layout: Layout) -> None:
         self.windows: list[Window] = []
@@ -121,7 +122,8 @@ def oldest_kept(head: int, depth: int) -> int:
 
 def operator_entry_size(layout: Layout) -> int:
     """Return the bytes of one entry of the operator table: its head, and room for the largest of
-    its messages."""
+    its messages.
+    """
     return OPERATOR_HEAD_SIZE + _up(
         max((m.size for m in layout.mailboxes if m.writer == CLOCK), default=0), LINE
     )

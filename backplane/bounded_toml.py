@@ -1,5 +1,6 @@
 """TOML text from outside, parsed within bounds: the time of a parse grows with the length of the
-text alone."""
+text alone.
+"""
 
 from __future__ import annotations
 

@@ -55,7 +55,8 @@ class ByteLock:
 
     def close_file(self) -> None:
         """Close the descriptor until `reopen`. A process from which this one was forked keeps the
-        lock."""
+        lock.
+        """
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1
@@ -64,7 +65,8 @@ class ByteLock:
 @contextmanager
 def locked(fd: int, address: int) -> Iterator[None]:
     """Hold a lock for a moment, in which an entry of a table is filled; other processes wait for it
-    no longer."""
+    no longer.
+    """
     lock = ByteLock(fd, address)
     try:
         while not lock.take():
@@ -110,7 +112,8 @@ def reopen_all(fd: int) -> None:
 
 def is_locked(fd: int, address: int) -> bool:
     """Return whether the byte at a bus address of an open segment is locked, without taking the
-    lock."""
+    lock.
+    """
     asked = _one_byte(fcntl.F_RDLCK, address)
     kind: int = _FLOCK.unpack(fcntl.fcntl(fd, fcntl.F_OFD_GETLK, asked))[0]
     return kind != fcntl.F_UNLCK

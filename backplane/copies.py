@@ -78,7 +78,8 @@ def fill_memory(segment: Segment, fd: int, tick: int) -> None:
 
 def leave(segment: Segment) -> None:
     """Let go of a segment, in the fork of a process that goes on with it: its memory, its file and
-    its locks. The fork must not use it before `enter`."""
+    its locks. The fork must not use it before `enter`.
+    """
     byte_lock.close_all()
     _map(segment, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS, 0, -1)
     file = os.fstat(segment.fd)
@@ -93,7 +94,8 @@ def leave(segment: Segment) -> None:
 
 def enter(segment: Segment, rack: str) -> None:
     """Redirect the views of `segment` to the segment of another rack with the same layout. Takes no
-    lock and claims no mailbox."""
+    lock and claims no mailbox.
+    """
     fd = os.open(shm_path(rack), os.O_RDWR)
     segment.rack = rack
     os.dup2(fd, segment.fd)

@@ -1,5 +1,6 @@
 """Exports of a package, imported on first use: a user of one name does not wait for the libraries
-of the others."""
+of the others.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +11,8 @@ from typing import Any
 
 def on_first_use(package: str, places: Mapping[str, Sequence[str]]) -> Callable[[str], Any]:
     """Return the `__getattr__` of a package that exports names of other modules: `places` lists
-    them by module."""
+    them by module.
+    """
     module_of = {name: module for module, names in places.items() for name in names}
 
     def exported(name: str) -> Any:

@@ -38,7 +38,8 @@ class Stage(IntEnum):
 @dataclass(frozen=True)
 class Injection:
     """One fault as an entry holds it: see `FaultEntry`. `when` is (mailbox, field, value): two
-    indices and a number."""
+    indices and a number.
+    """
 
     kind: int
     task: int
@@ -85,7 +86,8 @@ class FaultEntry:
 
     def acted(self, tick: int, shows: bool = True) -> None:
         """Note one action of the fault, and the time of the first one; count those that show: they
-        must be found."""
+        must be found.
+        """
         if self.struck_tick < 0:
             self.struck_ns = monotonic_ns()
             self.struck_tick = tick
@@ -105,12 +107,14 @@ class FaultTable:
     @property
     def generation(self) -> int:
         """Rises when a fault begins or ends: a task looks at the table only when this number has
-        changed."""
+        changed.
+        """
         return self._words[System.FAULTS]
 
     def add(self, injection: Injection) -> FaultEntry:
         """Fill a free entry; its fault begins when the clock finds it due. Raises
-        `FaultTableError`."""
+        `FaultTableError`.
+        """
         with locked(self._segment.fd, self._segment.map.faults):
             entry = next((e for e in self.entries if e.stage == Stage.FREE), None)
             if entry is None:

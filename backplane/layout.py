@@ -218,7 +218,8 @@ class Layout:
 
     def pacers(self, host: TaskSpec) -> set[str]:
         """Return the bus adapters in whose cycles a host board's program runs in lockstep: none of
-        an external one."""
+        an external one.
+        """
         return {
             task.name
             for task in self.tasks
@@ -240,7 +241,8 @@ class Layout:
 
     def due(self, task: TaskSpec) -> int:
         """Return the ticks from a release of a task until the first of its messages must be
-        there."""
+        there.
+        """
         sent = [
             m.interrupt.due
             for m in self.mailboxes
@@ -250,18 +252,21 @@ class Layout:
 
     def interrupting(self, slot: int) -> list[MailboxSpec]:
         """Return the mailboxes whose messages interrupt the board in a slot, by the slot of their
-        sender."""
+        sender.
+        """
         found = [m for m in self.mailboxes if m.interrupt is not None and slot in m.interrupt.slots]
         return sorted(found, key=lambda mailbox: self.task(mailbox.writer).slot)
 
     def handler(self, slot: int) -> str:
         """Return the task that serves the interrupts of the board in a slot: its first one. Raises
-        `StopIteration`."""
+        `StopIteration`.
+        """
         return next(task.name for task in self.tasks if task.slot == slot)
 
     def read_grid(self, mailbox: MailboxSpec, reader: str) -> TickGrid:
         """Return the ticks at which a task reads a mailbox; a planner's, its releases. Raises
-        `KeyError`."""
+        `KeyError`.
+        """
         exchanged = (e.grid for e in mailbox.exchanges if e.task == reader)
         return max(exchanged, default=self.task(reader).grid)
 
@@ -273,6 +278,7 @@ the adapter copies meanwhile."""
 
 def depth_for(span_ticks: int, every: int) -> int:
     """Return the slots, a power of two and at least 4, that keep `span_ticks` ticks of a writer of
-    period `every`."""
+    period `every`.
+    """
     wanted = max(4, -(-span_ticks // every) + 3)
     return 1 << (wanted - 1).bit_length()

@@ -1,5 +1,6 @@
 """The utility lines of the bus as shared words: SYSFAIL, SYSRESET, ACFAIL, and the emergency
-stop."""
+stop.
+"""
 
 from __future__ import annotations
 
@@ -59,7 +60,8 @@ class UtilityLines:
 
     def reset_emergency_stop(self) -> None:
         """Clear the latch. Raises `EmergencyStopError` with every bad input; the latch then stays
-        set."""
+        set.
+        """
         if bad := self.bad_inputs:
             raise EmergencyStopError(f"the emergency stop stays latched: {', '.join(bad)}")
         self._words[System.EMERGENCY_STOP] = 0

@@ -61,7 +61,8 @@ _FILES: list[tuple[int, int]] = []
 
 def note_used_files() -> None:
     """Note the pages of files that this process uses, for `touch_memory`: a fork does not inherit
-    their mapping."""
+    their mapping.
+    """
     _FILES[:] = [
         stretch for _, rights, pages in _mappings() if rights[:2] == "r-" for stretch in pages
     ]
@@ -89,7 +90,8 @@ def touch_memory() -> None:
 
 def _mappings() -> Iterator[tuple[tuple[int, int], str, list[tuple[int, int]]]]:
     """Yield span, rights and the stretches in memory of every mapping of this process that it may
-    read."""
+    read.
+    """
     with Path("/proc/self/pagemap").open("rb", buffering=0) as pagemap:
         for line in Path("/proc/self/maps").read_text().splitlines():
             addresses, rights, *_ = line.split(maxsplit=2)

@@ -86,7 +86,8 @@ def field(
 
 def _named(declared: Field, name: str, hint: Any) -> Field:
     """Return a declared field with the name and the annotation that stand beside it. Raises
-    `ValueError` with a reason."""
+    `ValueError` with a reason.
+    """
     if isinstance(declared.kind, MessageType):
         return replace(declared, name=name, unit="")
     is_name = isinstance(hint, type) and issubclass(hint, IntEnum)
@@ -176,7 +177,8 @@ class Message:
     @classmethod
     def zeros(cls, sizes: Mapping[str, int]) -> Self:
         """Return a message of this class, all bytes 0; `sizes` by name. Raises `MailboxError` when
-        one is missing."""
+        one is missing.
+        """
         return cls(cls.message_type.dtype(sizes))
 
     def clear(self) -> None:
@@ -248,7 +250,8 @@ def reason_of(status: Message) -> str:
 
 def state_name(state: int | None, otherwise: str = "") -> str:
     """Return the name of a level's state; of a user's level that has others, `otherwise` or the
-    number."""
+    number.
+    """
     return State(state).name.lower() if state in set(State) else otherwise or str(state)
 
 
@@ -261,7 +264,8 @@ def copied(message: B) -> B:
 
 def fill_counts(record: Any, counts: Iterable[float]) -> None:
     """Fill the fields of a record; an integer stays at the greatest that its field holds, whoever
-    drives it."""
+    drives it.
+    """
     kinds = (kind for kind, *_ in record.dtype.fields.values())
     record[...] = tuple(
         min(count, _greatest(kind)) for count, kind in zip(counts, kinds, strict=True)

@@ -48,7 +48,8 @@ class Client(IntEnum):
 @dataclass(frozen=True)
 class Request:
     """A command to issue: the index of its mailbox, its message, and its tick (-1: as soon as
-    possible)."""
+    possible).
+    """
 
     mailbox: int
     message: bytes
@@ -163,7 +164,8 @@ class OperatorTable:
 
     def lacking(self, requests: Sequence[Request]) -> list[Request]:
         """Return those of a run's commands, given in the order of issue, that do not wait here
-        already: each entry is issued at its tick or, added late, after it."""
+        already: each entry is issued at its tick or, added late, after it.
+        """
         waiting = sorted(self.waiting(), key=lambda entry: entry.tick)
         found = []
         for wanted in requests:

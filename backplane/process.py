@@ -28,20 +28,23 @@ STOPPED = "Tt"
 
 def start_time(pid: int) -> int:
     """Return the start time of a process, in kernel clock ticks since boot; 0 when there is none or
-    it is a zombie."""
+    it is a zombie.
+    """
     fields = _stat(pid)
     return int(fields[19]) if fields and fields[0] not in GONE else 0
 
 
 def state_of(pid: int) -> str:
     """Return the kernel's letter for a process's state: R, S, D, T (stopped), Z (dead, not reaped);
-    X: no process."""
+    X: no process.
+    """
     return (_stat(pid) or "X")[0]
 
 
 def processor_ns(pid: int) -> int:
     """Return the processor time used by a process so far, in ns, to about 10 ms; 0 when there is
-    none."""
+    none.
+    """
     fields = _stat(pid)
     return (int(fields[11]) + int(fields[12])) * (1_000_000_000 // _TICKS_A_SECOND) if fields else 0
 
@@ -57,7 +60,8 @@ def _stat(pid: int) -> list[str]:
 
 def is_alive(pid: int, started: int = 0) -> bool:
     """Say whether a process is alive; with `started`, whether it is still the same process, since
-    pids are reused."""
+    pids are reused.
+    """
     found = start_time(pid) if pid > 0 else 0
     return bool(found) and started in (0, found)
 
@@ -75,7 +79,8 @@ def readable(fd: int, timeout_s: float) -> bool:
 
 def compute_until(processor_time_ns: int) -> None:
     """Compute until the calling process has used that much processor time (`process_time_ns`:
-    without preemption)."""
+    without preemption).
+    """
     while process_time_ns() < processor_time_ns:
         pass
 
@@ -140,7 +145,8 @@ def _reserve(reservation: Reservation) -> bool:
 
 def wake_up_exactly() -> None:
     """Let the calling process, if it is an ordinary one, sleep as long as it wants and no longer:
-    to save power, the system wakes such processes up to 50 us late."""
+    to save power, the system wakes such processes up to 50 us late.
+    """
     _libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
 
 
@@ -167,7 +173,8 @@ def cores_kept_awake() -> Iterator[str]:
 
 def mapped_and_locked(pid: int) -> tuple[int, int]:
     """Return the bytes of memory that a process has mapped, and those locked; 0 when there is no
-    process."""
+    process.
+    """
     found: list[str] = []
     with suppress(FileNotFoundError, ProcessLookupError):
         found = re.findall(r"Vm(?:Size|Lck):\s*(\d+)", Path(f"/proc/{pid}/status").read_text())

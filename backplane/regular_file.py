@@ -23,7 +23,8 @@ _KINDS = {
 
 class RefusedFileError(OSError):
     """A file that is not a regular file, or is too large; `strerror` is the reason as a
-    sentence."""
+    sentence.
+    """
 
     def __str__(self) -> str:
         return f"{self.filename}: {self.strerror}"

@@ -15,7 +15,8 @@ MOST = 1 << 48
 
 class Drained(NamedTuple):
     """Rows read from a ring, oldest first, and the number of rows overwritten before they were
-    read."""
+    read.
+    """
 
     rows: np.ndarray
     lost: int

@@ -60,13 +60,15 @@ class Launch(NamedTuple):
     @property
     def wall_offset_ns(self) -> int:
         """Wall clock less CLOCK_MONOTONIC: one for the whole run, as the wall clock may be set
-        meanwhile."""
+        meanwhile.
+        """
         return self.created_ns - self.monotonic_ns
 
 
 class CycleCounts(NamedTuple):
     """Cycles of a task: plans or cycles missed, cycles skipped, and all that were due. A plan takes
-    `plan` cycles."""
+    `plan` cycles.
+    """
 
     missed: int
     skipped: int
@@ -239,7 +241,8 @@ class Segment:
 
     def read_head(self) -> None:
         """Read the texts. Raises `SegmentError` when size or version is wrong, or a text is
-        damaged."""
+        damaged.
+        """
         if self.words[Head.MAGIC] != MAGIC or self.words[Head.VERSION] != VERSION:
             raise SegmentError(
                 f"rack '{self.rack}': layout version {self.words[Head.VERSION]}; this program"
@@ -276,7 +279,8 @@ class Segment:
 
     def count_cycles(self, task: TaskSpec, tick: int) -> CycleCounts:
         """Count the cycles of a task by `tick`. Releases since its last cycle are skipped ones as
-        soon as their time is over."""
+        soon as their time is over.
+        """
         block = self.block(task.name)
         skipped = block[Block.SKIPPED] + task.count_unfinished(block[Block.DONE], tick)
         return CycleCounts(
@@ -290,7 +294,8 @@ class Segment:
 
     def is_locked(self, address: int) -> bool:
         """Say whether a process holds the lock on the byte at a bus address: see
-        `rack.backplane.byte_lock`."""
+        `rack.backplane.byte_lock`.
+        """
         return is_locked(self.fd, address)
 
     @property
@@ -301,7 +306,8 @@ class Segment:
     @property
     def launcher(self) -> int:
         """Process id of the program that made the segment; 0 if that has another PID namespace than
-        this process, as in another container: there the number means another process."""
+        this process, as in another container: there the number means another process.
+        """
         words = self.words
         is_here = words[Head.LAUNCHER_NAMESPACE] == _pid_namespace()
         return words[Head.LAUNCHER_PID] if is_here else 0
@@ -333,7 +339,8 @@ class Segment:
     @property
     def has_its_name(self) -> bool:
         """Whether the rack's name still leads to this segment: another launch may have replaced
-        it."""
+        it.
+        """
         try:
             named = shm_path(self.rack).stat()
         except FileNotFoundError:
@@ -347,7 +354,8 @@ class Segment:
 
     def close(self) -> None:
         """Close the file descriptor; the mapping lasts as long as views of it. A launcher counts as
-        ended then."""
+        ended then.
+        """
         self.release()
         if self.fd >= 0:
             os.close(self.fd)
@@ -361,7 +369,8 @@ def racks() -> list[str]:
 
 def stranger(rack: str) -> str | None:
     """Return the kind of a foreign entry under a rack's name, as in "directory"; None for a file,
-    or no entry."""
+    or no entry.
+    """
     try:
         mode = shm_path(rack).lstat().st_mode
     except OSError:  # no such file, or an impossible name
@@ -400,7 +409,8 @@ def _shm_name(rack: str) -> str:
 
 def layout_of(plain: dict[str, Any]) -> Layout:
     """Return a layout from the plain data that `dataclasses.asdict` makes of it. Recordings of
-    earlier versions lack some of it."""
+    earlier versions lack some of it.
+    """
     layout: Layout = _restored(Layout, plain)
     return layout
 

@@ -104,7 +104,8 @@ def wake_semaphore(segment: MappedMemory, task: str) -> Semaphore:
 
 def done_semaphore(segment: MappedMemory, task: str) -> Semaphore:
     """Return the semaphore on which lockstep waits for a task's reports, or for the crate to report
-    its loss."""
+    its loss.
+    """
     return Semaphore(segment.bytes, segment.map.done[task])
 
 

@@ -112,7 +112,8 @@ class CycleRecord:
 
     def ended_ns(self, tick: int) -> int | None:
         """Return the end of the cycle released at `tick`, CLOCK_MONOTONIC; None without a record of
-        it."""
+        it.
+        """
         count = self._block[Block.TRACE_HEAD]
         for number in range(count, max(0, count - self._depth), -1):
             at = self._at(number)

@@ -117,7 +117,8 @@ class Run(IntEnum):
 
 class Demand(IntEnum):
     """Values of `System.DEMAND`: the demand of the rack's safety on the arm; a greater one is
-    stronger."""
+    stronger.
+    """
 
     NONE = 0
     STOP = 1  # controlled stop: ramp to rest, then brake

@@ -25,7 +25,8 @@ UNKEPT = "no snapshots: "
 
 class Failure(Exception):
     """A command, or a call of a program, that did not work. The message is for the user, `status`
-    the exit status of the command."""
+    the exit status of the command.
+    """
 
     def __init__(self, reason: str, status: int = 1) -> None:
         super().__init__(reason)
@@ -50,7 +51,8 @@ class SnapshotError(BoardError):
 @dataclass(frozen=True)
 class Mistake:
     """One mistake in a config: its place, the value there (None: none), and the reason or the
-    permitted values."""
+    permitted values.
+    """
 
     place: str
     value: Any
@@ -68,7 +70,8 @@ Mistakes = Iterator[Mistake]
 
 class ConfigError(BoardError):
     """A config that cannot run. `mistakes` holds every mistake found; the text has one line per
-    mistake."""
+    mistake.
+    """
 
     def __init__(self, mistakes: Iterable[Mistake]) -> None:
         self.mistakes = list({str(mistake): mistake for mistake in mistakes}.values())

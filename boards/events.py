@@ -81,7 +81,8 @@ class Braking:
 
 def brakings(events: Sequence[Event], end: int, tick_ms: float) -> tuple[Braking, ...]:
     """Return every time that brakes engaged in a run of `end` ticks, by its events; not those of
-    the start."""
+    the start.
+    """
     changes = [event for event in events if event.code in ("brakes_closed", "brakes_opened")]
     found = [
         (one.subject, one.tick - int(one.value), one.tick)
@@ -148,7 +149,8 @@ class Outcome:
     @property
     def failure(self) -> str:
         """Why the run failed: a fault, or a task that was refused, failed or cut short; empty if it
-        succeeded."""
+        succeeded.
+        """
         faults = "; ".join(self.faults)
         if self.cause in SUCCESSES:
             return faults
@@ -247,7 +249,8 @@ class Ending:
 
     def latched(self) -> list[str]:
         """Return a line for every level whose last status reports an error, except the level that
-        ends the run; and for every arm that counts what its level does not report."""
+        ends the run; and for every arm that counts what its level does not report.
+        """
         told = {
             board: f"level '{board}': {reason_of(status) or f'error {status.error}'}"
             for board, status in statuses(self._segment, "error")
@@ -304,7 +307,8 @@ class Ending:
 
     def ends(self, goals: Mapping[int, GoalConfig]) -> tuple[ObjectEnd, ...]:
         """Return where objects that have goals ended, as sensed last; none if nothing senses
-        them."""
+        them.
+        """
         for box in self._segment.layout.mailboxes:
             if (
                 box.message == "scene"
@@ -329,7 +333,8 @@ class Ending:
 
     def _silence(self) -> int:
         """Return the ticks since the last status of the level that ends the run; 0 if permitted, or
-        if it has ended."""
+        if it has ended.
+        """
         assert self._observer is not None, "some level ends the run"
         reading = self._observer.peek()
         if reading.message.state in (State.DONE, State.ERROR):

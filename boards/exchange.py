@@ -73,7 +73,8 @@ class Taken(NamedTuple):
 
 class ExchangeRecord:
     """Fills a board's exchange message from its inputs, which come in the order of
-    `exchange_message`."""
+    `exchange_message`.
+    """
 
     def __init__(self, inputs: Sequence[Taken], message: Message) -> None:
         self._inputs = tuple(inputs)

@@ -29,7 +29,8 @@ def mailboxes_of(source: Source) -> tuple[str, ...]:
 @dataclass(frozen=True)
 class BusTimes:
     """A slower bus: minimum processor time of each kind of access, ns; see
-    `[board.<name>.transfer]`."""
+    `[board.<name>.transfer]`.
+    """
 
     read_ns: int = 0
     write_ns: int = 0
@@ -41,7 +42,8 @@ class BusTimes:
 class SnapshotPolicy:
     """Snapshots that a rack in lockstep takes: the standstill for them is one part in `part` of its
     time; 0: it does not matter. Besides, there is one each `every` ticks, unless that is 0, and one
-    before the tick `at`, if that is given."""
+    before the tick `at`, if that is given.
+    """
 
     part: int = 40
     every: int = 0

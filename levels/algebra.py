@@ -55,7 +55,8 @@ def gram(matrix: Array) -> Array:
 
 def solve(matrix: Array, vector: Array) -> Array:
     """Return x (n,) with `matrix` x = `vector`; `matrix` (n, n) is symmetric and positive definite,
-    like an inertia."""
+    like an inertia.
+    """
     factor = matrix.copy()
     solution = np.empty(len(vector))
     mujoco.mju_cholFactor(factor, LEAST_PIVOT)

@@ -43,7 +43,8 @@ on_compile: Callable[[str], object] | None = None
 
 class compiled(Generic[_P, _R]):  # noqa: N801  # a decorator
     """Mark a function for compilation. Arguments are numbers, arrays and records; it may call
-    others marked so."""
+    others marked so.
+    """
 
     def __init__(
         self, function: Callable[_P, _R], types: str = "", records: np.dtype[Any] | None = None
@@ -55,12 +56,14 @@ class compiled(Generic[_P, _R]):  # noqa: N801  # a decorator
 
     def __call__(self, *args: _P.args, **kwargs: _P.kwargs) -> _R:
         """Call the function under numpy, and those that it calls: the reference of the compiled
-        one."""
+        one.
+        """
         return self._function(*args, **kwargs)
 
     def load(self) -> Callable[_P, _R]:
         """Return the compiled function; it is compiled, or read from the cache, at the first call
-        with its types."""
+        with its types.
+        """
         if self._machine is None:
             self._machine = _jit(self)
         return self._machine
@@ -79,7 +82,8 @@ class compiled(Generic[_P, _R]):  # noqa: N801  # a decorator
 
     def source(self) -> Iterator[bytes]:
         """Yield what determines the machine code: instructions, constants, and the values of names,
-        functions that are called included. Comments, docstrings and places in files do not."""
+        functions that are called included. Comments, docstrings and places in files do not.
+        """
         function: Any = self._function
         code = function.__code__
         known = function.__globals__
@@ -170,7 +174,8 @@ class _Kept:
 
     def save_overload(self, types: Any, result: Any) -> None:
         """Keep the code for these types, and none of an earlier state of the function; say so if
-        it cannot be kept."""
+        it cannot be kept.
+        """
         from numba.core.serialize import dumps
 
         if result.library.has_dynamic_globals:
@@ -229,7 +234,8 @@ def _value(value: object) -> Iterator[bytes]:
 @cache
 def _folder() -> Path:
     """Return the folder of the code that is compiled from this checkout. Raises `OSError` if the
-    user has no home folder."""
+    user has no home folder.
+    """
     try:
         home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "nasrem-rack"
     except RuntimeError:

@@ -31,7 +31,8 @@ class ProgramError(LevelError):
 
 class Refused(LevelError):
     """A command that cannot be carried out: `code` is one of `rack.levels.messages.Error`,
-    `action` the number of the refused action, where a program has several."""
+    `action` the number of the refused action, where a program has several.
+    """
 
     def __init__(self, code: int, reason: str, action: int | None = None) -> None:
         super().__init__(reason)

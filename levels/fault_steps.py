@@ -89,7 +89,8 @@ class SensorStep:
 @dataclass(frozen=True)
 class MotorStep:
     """Weakens motors. `part` returns the part of its torque limit that a motor still gives, 0 to
-    1."""
+    1.
+    """
 
     part: Callable[[ActiveFault], float]
 
@@ -97,7 +98,8 @@ class MotorStep:
 @dataclass(frozen=True)
 class CommandStep:
     """Corrupts the torques commanded. `act` takes torques and limits, N m, and returns torques
-    (joints,)."""
+    (joints,).
+    """
 
     act: Callable[[Array, Array, ActiveFault], Array]
 
@@ -105,7 +107,8 @@ class CommandStep:
 @dataclass(frozen=True)
 class TendonStep:
     """Tears a tendon of a hand, so that it gives no tension: that of `joint` on `side`, 0 flexor, 1
-    extensor."""
+    extensor.
+    """
 
 
 ARM_STEPS = (SensorStep, MotorStep, CommandStep)

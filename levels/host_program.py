@@ -52,7 +52,8 @@ class Bus(Protocol):
     @property
     def time_s(self) -> float:
         """Time since some moment, s: in lockstep simulated time, in real time that of
-        CLOCK_MONOTONIC."""
+        CLOCK_MONOTONIC.
+        """
 
     @property
     def is_over(self) -> bool:
@@ -60,7 +61,8 @@ class Bus(Protocol):
 
     def wait(self, timeout_s: float) -> bool:
         """Wait until a message arrives; False when none has after the timeout, by `time_s`, or when
-        the run ends."""
+        the run ends.
+        """
 
     @property
     def tasks(self) -> list[str]:
@@ -68,7 +70,8 @@ class Bus(Protocol):
 
     def address(self, name: str) -> int:
         """Return the bus address of a mailbox, or of the control block of a task. Raises
-        `LookupError`."""
+        `LookupError`.
+        """
 
     def words(self, address: int, count: int = 1) -> list[int]:
         """Return words of 8 bytes of the crate's memory, from a bus address on; `rack check` prints
@@ -87,7 +90,8 @@ class HostReceiver(Protocol[M_co]):
 
     def read(self) -> Reading[M_co]:
         """Return the newest message; `earlier` holds the unread ones before it, as far as the
-        mailbox keeps them."""
+        mailbox keeps them.
+        """
 
 
 class HostSender(Protocol[M_co]):
@@ -96,11 +100,13 @@ class HostSender(Protocol[M_co]):
     @property
     def message(self) -> M_co:
         """The next message: all its fields are 0, but for the `id` of a command, which is the
-        number of the message."""
+        number of the message.
+        """
 
     def send(self) -> bool:
         """Send a copy of the message, and begin the next one; return False, and leave it as it is,
-        when too many wait at the adapter."""
+        when too many wait at the adapter.
+        """
 
     @property
     def sent(self) -> int:
@@ -128,7 +134,8 @@ class ProgramInput(InputPort[M]):
 
 class ProgramOutput(Output[M]):
     """A port that a host program writes, the mailbox `<board>.<port>`, for a bus adapter to read:
-    an attribute that is a `HostSender`."""
+    an attribute that is a `HostSender`.
+    """
 
     def __init__(self, message: type[M]) -> None:
         super().__init__(message)

@@ -170,13 +170,15 @@ class Program(Table):
 
     def misfits(self, robot: RobotConfig | None, scene: SceneConfig) -> Misfits:
         """Yield key, as in "action[0].object", value and reason of each entry that does not suit
-        arm or scene."""
+        arm or scene.
+        """
         return ()
 
     @classmethod
     def read(cls, table: Mapping[str, Any], robot: RobotConfig, scene: SceneConfig) -> Self:
         """Return the program in the `[task]` table. Raises `ProgramError`, with one line per
-        mistake."""
+        mistake.
+        """
         try:
             program = cls.model_validate(table)
         except ValidationError as error:
@@ -193,7 +195,8 @@ class Program(Table):
 
     def goals(self) -> Iterable[GoalConfig]:
         """Yield where the program takes objects, in its order: checked when it says that it is
-        done."""
+        done.
+        """
         return ()
 
 
@@ -206,7 +209,8 @@ class Pace(NamedTuple):
 
 class Finding(NamedTuple):
     """A fault that a level has found; its board raises the alarm. See
-    `rack.backplane.watch.alarms.Alarm`."""
+    `rack.backplane.watch.alarms.Alarm`.
+    """
 
     alarm: Alarm
     subject: int = -1  # joint, geom, ...: by alarm; -1: none in particular
@@ -310,16 +314,19 @@ class LevelSection:
     @classmethod
     def preload(cls) -> None:
         """Load what every process of the level needs, such as compiled code. Called once, before
-        the crate forks."""
+        the crate forks.
+        """
         preload(*cls.preloads)
 
     def self_test(self) -> None:
         """Raise `LevelError` when the level must not start: the board then holds SYSFAIL, and the
-        launch fails."""
+        launch fails.
+        """
 
     def room(self, port: str) -> int:
         """Return how many messages to take from each queue that `port` reads, asked before each
-        read. Default: all."""
+        read. Default: all.
+        """
         return ALL
 
     def close(self) -> None:
@@ -415,7 +422,8 @@ class Executor(LevelSection, ABC):
 
     def take_settings(self, tick: int) -> None:
         """Set live parameters as their operator commands, and answer in a status that can. Called
-        by the board before `process`."""
+        by the board before `process`.
+        """
         self._live_orders.take(OPERATOR.__get__(self, type(self)), self._set)
         status = vars(self).get("status")
         if isinstance(status, AnsweringStatus):
@@ -429,7 +437,8 @@ class Executor(LevelSection, ABC):
     @classmethod
     def names(cls, params: Mapping[str, Any]) -> Sequence[str]:
         """Return what an operator's settings, and alarms of the level by number, name; `params` may
-        be invalid."""
+        be invalid.
+        """
         return ()
 
     @classmethod
@@ -448,13 +457,15 @@ class Executor(LevelSection, ABC):
         cls, what: Operation, params: Mapping[str, Any], scene: SceneConfig
     ) -> Sequence[str]:
         """Return the names that an operator may give with an operation; see
-        `rack.levels.operator.NAMED`."""
+        `rack.levels.operator.NAMED`.
+        """
         return cls.names(params)
 
     @classmethod
     def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, type[Message]]) -> MadePorts:
         """Return the ports that `params`, which may have mistakes, makes; `types`: mailboxes that
-        classes declare."""
+        classes declare.
+        """
         return MadePorts()
 
     def inject(self, faults: Sequence[Fault]) -> None:
@@ -479,7 +490,8 @@ class Planner(LevelSection, ABC):
 
     def wanted(self, tick: int) -> bool:
         """Return, in well under a cycle, whether a plan is wanted now. Default: a command is
-        new."""
+        new.
+        """
         command: Reading[Message] = getattr(self, "above")  # noqa: B009  # a port of most
         return command.is_new
 

@@ -4,7 +4,8 @@ An operator may command every level that reads "own.operator" and declares `comm
 to the level above it or in its place. The level follows with `Orders`; its status derives from
 `AnsweringStatus`, its command from `RelayedCommand`. `operator` is passed down with every command,
 so the lowest status shows on which command its torque is based: the system's response can be
-measured."""
+measured.
+"""
 
 from __future__ import annotations
 
@@ -298,7 +299,8 @@ class Orders:
 
     def rests_on(self, above: int) -> int:
         """Return the newest command that this cycle rests on; `above` is that of the command from
-        above."""
+        above.
+        """
         return max(self.basis, above)
 
     def report(self, status: AnsweringStatus, above: int = 0) -> None:
@@ -314,7 +316,8 @@ class Orders:
 
 def answered(status: AnsweringStatus | AnyMessage) -> int:
     """Return the newest command that a level had taken up by this status of it, so that a restarted
-    board does not do it twice."""
+    board does not do it twice.
+    """
     # The answer shown may be a late one, to a command before the newest.
     return max(status.order, status.operator)
 

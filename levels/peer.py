@@ -2,7 +2,8 @@
 for levels to read.
 
 A level that works together with another rack reads it with `Input(PeerPresence,
-"lan.peer_<rack>")`: whether that rack is there, and how its simulated time lies next to ours."""
+"lan.peer_<rack>")`: whether that rack is there, and how its simulated time lies next to ours.
+"""
 
 from __future__ import annotations
 

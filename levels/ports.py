@@ -148,7 +148,8 @@ class Output(Port[M]):
 
     def is_due(self, tick: int, every: int, phase: int) -> bool:
         """Return whether the cycle released at `tick`, every `every` ticks from tick `phase`,
-        writes it."""
+        writes it.
+        """
         return (tick - phase + every) % (self.cycles * every) == 0
 
 
@@ -207,7 +208,8 @@ class TimedOutput(SentOutput[M]):
 
 class MadePorts(NamedTuple):
     """Ports that a config makes, in addition to those that a class declares; not `is_whole` if some
-    are unknown."""
+    are unknown.
+    """
 
     inputs: Mapping[str, InputPort[Any]] = MappingProxyType({})
     outputs: Mapping[str, Output[Any]] = MappingProxyType({})

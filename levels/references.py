@@ -1,5 +1,6 @@
 """What a config names as "package.module:Name", imported; also by the names that earlier versions
-had for it."""
+had for it.
+"""
 
 from __future__ import annotations
 
@@ -75,7 +76,8 @@ def module_and_name(reference: str, is_tried: bool = True) -> tuple[ModuleType, 
 
 def find_class(reference: str, base: type[T], is_tried: bool = True) -> type[T]:
     """Return the subclass of `base` that "package.module:Class" names. Raises `LookupError` with
-    the reason. `is_tried` is that of `module_and_name`."""
+    the reason. `is_tried` is that of `module_and_name`.
+    """
     module, name = module_and_name(reference, is_tried)
     found = getattr(module, name, None)
     if not isinstance(found, type) or not issubclass(found, base):
@@ -98,7 +100,8 @@ def find_class(reference: str, base: type[T], is_tried: bool = True) -> type[T]:
 @cache
 def _trial(module: str) -> str:
     """Import a module in a child; return why it must not be imported here, if so. What it raises is
-    no such reason."""
+    no such reason.
+    """
     parent = os.getpid()
     try:
         child = os.fork()

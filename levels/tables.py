@@ -192,7 +192,8 @@ STILL_PARTS = 20
 
 class FollowConfig(Table):
     """`[[robot.gripper.follow]]`: a joint that the gripper moves, though the model couples it to
-    nothing. Its own actuator is removed."""
+    nothing. Its own actuator is removed.
+    """
 
     joint: str
     """MJCF joint that follows the driven one"""
@@ -249,7 +250,8 @@ class GripperConfig(Table):
 
 class WristConfig(Table):
     """`[robot.wrist]`: a force/torque sensor between arm and tool, and the arm's limits on
-    contact."""
+    contact.
+    """
 
     force: str
     """MJCF force sensor; its cutoff is its range, N"""
@@ -276,7 +278,8 @@ class FingerConfig(Table):
 
 class HandConfig(Table):
     """`[robot.hand]`: a hand whose joints are driven by pairs of tendons, which can only pull. One
-    value per joint."""
+    value per joint.
+    """
 
     finger: tuple[FingerConfig, ...] = Field(min_length=1)
     """the fingers"""
@@ -304,7 +307,8 @@ class ToolConfig(Table):
 
 class RobotConfig(Table):
     """`[robot]`: an arm, by its MJCF file and the data missing there. Lists have one value per
-    joint."""
+    joint.
+    """
 
     model: Path = Field(strict=False)
     """MJCF file of the arm and its cell; relative to the config"""
@@ -426,7 +430,8 @@ class PushConfig(Table):
 
 class GoalConfig(Table):
     """`[[scene.goal]]`: where the task takes an object. A task of transfers states goals by
-    itself."""
+    itself.
+    """
 
     object: str
     """object that the task moves, or keeps"""

@@ -1,5 +1,6 @@
 """The world model: global memory of objects and obstacles, updated from sensing, read by every
-planner."""
+planner.
+"""
 
 from __future__ import annotations
 
@@ -102,6 +103,7 @@ def distances(poses: Array, others: Array) -> Array:
 
 def turns(poses: Array, others: Array) -> Array:
     """Return the angles, rad, between the orientations of poses, both (bodies, 7); q and -q are the
-    same."""
+    same.
+    """
     w, x, y, z = (poses * others)[:, 3:].T
     return 2.0 * each(math.acos, np.minimum(np.abs(w + x + y + z), 1.0))

@@ -143,7 +143,8 @@ class ClosedInput(TextIOBase):
 
 def _open_closed_streams() -> None:
     """Give closed standard streams their descriptors back: the next file that is opened would get
-    one, and what is printed."""
+    one, and what is printed.
+    """
     # The lowest free descriptor is that of the first closed stream.
     if sys.stdin is None:
         os.open(os.devnull, os.O_RDONLY)
@@ -207,7 +208,8 @@ def _flush(text: str = "") -> None:
 
 def _head_start(arguments: Sequence[str]) -> AbstractContextManager[CrateLine | None]:
     """Start the crate of `rack run`, which imports on the other core what takes longest; no other
-    command has one."""
+    command has one.
+    """
     if (
         arguments[:1] != ["run"]
         or len(arguments) == 1

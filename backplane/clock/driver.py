@@ -81,7 +81,8 @@ class ClockDriver(ABC):
 
     def begin(self, tick: int) -> bool:
         """Publish `tick` and do the work due before its releases; False when the tick is
-        skipped."""
+        skipped.
+        """
         self.words[System.TICK] = tick
         if self.controller is not None:
             self.controller.begin(tick)
@@ -138,7 +139,8 @@ class ClockDriver(ABC):
 
     def await_state(self, task: ReleasedTask, condition: Callable[[], bool]) -> bool:
         """In lockstep, wait until `condition` on the state of a task holds, which the task's
-        reports make true; False when the launcher is gone. Real time does not wait."""
+        reports make true; False when the launcher is gone. Real time does not wait.
+        """
         return True
 
     @abstractmethod
@@ -173,7 +175,8 @@ class ClockDriver(ABC):
 
 class RealtimeDriver(ClockDriver):
     """The clock in real time, on an absolute grid of CLOCK_MONOTONIC. A late clock skips ticks and
-    counts them."""
+    counts them.
+    """
 
     def __init__(self, segment: Segment, ended: Ended, alarms: AlarmWriter | None = None) -> None:
         super().__init__(segment, ended, alarms)
@@ -207,7 +210,8 @@ class RealtimeDriver(ClockDriver):
 
     def _release(self, tick: int, last: int) -> None:
         """Give every task its release in (last, tick]: those that sleep in time, the others at the
-        grid point."""
+        grid point.
+        """
         due = self.due(tick, last)
         point = self._time_of(tick)
         sleeping = [task for task in due if task.sleeps]

@@ -97,7 +97,8 @@ class LockstepDriver(ClockDriver):
 
     def _batch_end(self, due: list[ReleasedTask], tick: int) -> int:
         """Return the tick before which nothing happens but cycles of the one executor that is due;
-        the next one if there is more to do."""
+        the next one if there is more to do.
+        """
         controller = self.controller
         if len(due) != 1 or controller is None or self._one_at_a_time:
             return tick + 1
@@ -153,7 +154,8 @@ class LockstepDriver(ClockDriver):
 
     def await_state(self, task: ReleasedTask, condition: Callable[[], bool]) -> bool:
         """Wait until `condition` holds, which the task's reports make true; False when the launcher
-        is gone."""
+        is gone.
+        """
         wait = task.done.wait
         while not condition():
             # The bound may be that of an earlier wait: a timeout that comes early costs one look
@@ -173,7 +175,8 @@ class LockstepDriver(ClockDriver):
 
     def _wait_for_follower(self, tick: int) -> bool:
         """Wait for a recorder, however slow, before its rings overflow: in lockstep time stands
-        still meanwhile."""
+        still meanwhile.
+        """
         words = self.words
         since = time.monotonic()
         while (pid := words[System.FOLLOWER_PID]) and self._is_ahead(tick):
@@ -188,7 +191,8 @@ class LockstepDriver(ClockDriver):
 
     def _is_ahead(self, tick: int) -> bool:
         """Say whether the recorder must catch up first; rings that are flooded hold little more
-        than a tick."""
+        than a tick.
+        """
         if self.is_flooded and self.words[System.FOLLOWER_DRAINED] < tick - 1:
             return True
         return self.words[System.FOLLOWER_TICK] < tick - self._history_ticks

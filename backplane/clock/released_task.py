@@ -54,7 +54,8 @@ class ReleasedTask:
 
     def is_free(self, release: int) -> bool:
         """Say whether the task can take a release; it cannot while it works on a plan or is
-        lost."""
+        lost.
+        """
         block = self.block
         return block[Block.DEADLINE] <= release and not self.is_lost
 
@@ -112,7 +113,8 @@ class ReleasedTask:
     @property
     def is_ready(self) -> bool:
         """Whether a lost task's new process waits for its first release; that of a host board may
-        be done already."""
+        be done already.
+        """
         return self.block[Block.STATE] in (TaskState.READY, TaskState.RUNNING, TaskState.ENDED)
 
     @property
@@ -137,7 +139,8 @@ class ReleasedTask:
 
 def by_priority(layout: Layout) -> list[TaskSpec]:
     """Return the tasks in the order in which the clock releases them: executors by rate, then
-    planners."""
+    planners.
+    """
     return sorted(layout.tasks, key=lambda t: (t.role == "planner", t.every, t.phase, t.slot))
 
 
@@ -152,7 +155,8 @@ class Watchdog:
 
     def check(self, task: ReleasedTask, tick: int) -> None:
         """Raise the alarms for a task that has missed a release by `tick`, and find out whether it
-        hangs."""
+        hangs.
+        """
         missed = task.missed
         spec = task.spec
         if missed == 1:

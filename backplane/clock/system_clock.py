@@ -29,7 +29,8 @@ class SystemClock:
 
     def now(self) -> int:
         """Return the current tick: in real time by the grid, as the clock board may be late; else
-        the newest tick."""
+        the newest tick.
+        """
         if self.is_lockstep:
             return self._words[System.TICK]
         return (monotonic_ns() - self._words[System.EPOCH_NS]) // self._words[System.PERIOD_NS]

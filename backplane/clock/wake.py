@@ -51,7 +51,8 @@ class NextCycle:
         self, segment: Segment, task: str, clock_alarms: AlarmWriter | None = None
     ) -> None:
         """Wait for the releases of `task`; with `clock_alarms`, check a silent clock and raise an
-        alarm there."""
+        alarm there.
+        """
         self._spec = spec = segment.layout.task(task)
         self._words = segment.words
         self._block = segment.block(task)
@@ -136,7 +137,8 @@ class NextCycle:
 
     def _sleep(self) -> bool:
         """Sleep to the next release's grid point or, if that has passed, to the task's next one or
-        a late release."""
+        a late release.
+        """
         words = self._words
         now = monotonic_ns()
         deadline = bound = now + int(CHECK_S * 1e9)
@@ -220,13 +222,15 @@ class SilentClock:
 
     def patience_ns(self, expected: int) -> int:
         """Return how long to wait, ns, before the next check, if the next release is that of tick
-        `expected`."""
+        `expected`.
+        """
         late = self._clock.time_of(expected + CLOCK_TICKS) - monotonic_ns()
         return late if late > 0 else CLOCK_TICKS * self._clock.period_ns
 
     def check(self) -> None:
         """Raise one alarm for a clock that makes no ticks: its process is stopped, dead, or silent
-        for too long."""
+        for too long.
+        """
         now = self._clock.now()
         newest = self._words[System.TICK]
         if now - newest < CLOCK_TICKS:

@@ -92,7 +92,8 @@ def row_dtype(spec: MailboxSpec) -> np.dtype:
 
 def chains(segment: Segment, until: int) -> dict[str, tuple[int, int]]:
     """Return serial and chain of every timed mailbox's newest message that was visible before tick
-    `until`."""
+    `until`.
+    """
     found = {}
     for spec in segment.layout.timed:
         slots = Slots(segment, spec)
@@ -110,7 +111,8 @@ def chains(segment: Segment, until: int) -> dict[str, tuple[int, int]]:
 
 def digest(segment: Segment, until: int | None = None) -> str:
     """Return the run's digest, 32 hexadecimal digits, up to tick `until` (default: where it
-    stopped)."""
+    stopped).
+    """
     stop = segment.words[System.STOP_TICK] if until is None else until
     total = blake2b(digest_size=16)
     for name, (serial, chain) in sorted(chains(segment, stop).items()):

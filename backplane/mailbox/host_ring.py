@@ -33,7 +33,8 @@ class HostWriter(DoubleBufferWriter):
 
     def send(self, tick: int) -> bool:
         """Publish `message`, written at `tick`; return False, and count it, when the ring is
-        full."""
+        full.
+        """
         if self._box[Box.HEAD] - self._box[Box.TAKEN] >= self.spec.capacity:
             self._box[Box.REFUSED] += 1
             return False
@@ -42,7 +43,8 @@ class HostWriter(DoubleBufferWriter):
 
 class HostReader:
     """The adapter's end of a ring. `taken` and `refused` count messages taken from it, and those
-    that were bad."""
+    that were bad.
+    """
 
     def __init__(self, segment: Segment, name: str) -> None:
         self.spec = spec = segment.layout.mailbox(name)
@@ -80,7 +82,8 @@ class HostReader:
 
     def take_newest(self, most: int) -> AnyMessage | None:
         """Take all that wait and return the newest good one, looking at no more than `most`; None:
-        there is none."""
+        there is none.
+        """
         waiting = self.waiting
         head = self._box[Box.HEAD]
         self._box[Box.TAKEN] = head
@@ -104,7 +107,8 @@ class HostReader:
 
 def is_proper(record: np.ndarray | np.void, fields: Sequence[FieldSpec]) -> bool:
     """Say whether a message, or some groups of one, hold only what their types permit: finite
-    numbers, lengths, members of enums, ASCII."""
+    numbers, lengths, members of enums, ASCII.
+    """
     return all(_is_permitted(record[field.name], field) for field in fields)
 
 

@@ -17,7 +17,8 @@ from typing import NamedTuple
 
 class Inbox:
     """A first-in-first-out server with `depth` places to wait. `lost` counts arrivals that found
-    all of them taken."""
+    all of them taken.
+    """
 
     def __init__(self, depth: int) -> None:
         self.depth = depth
@@ -29,7 +30,8 @@ class Inbox:
 
     def arrive(self, at_ns: int, service_ns: int) -> int | None:
         """Return the end of the service of a message that arrives, not before the last one; None:
-        it is lost."""
+        it is lost.
+        """
         starts = self._starts
         while starts and starts[0] <= at_ns:
             starts.popleft()
@@ -76,7 +78,8 @@ class Burst(NamedTuple):
 
 def burst_of(sources: Sequence[InterruptSource]) -> Burst:
     """Return the worst case of an inbox with these sources: the critical instant of a
-    first-in-first-out server."""
+    first-in-first-out server.
+    """
     load = sum(source.service_ns / source.every_ns for source in sources)
     if load >= FULL_LOAD:
         return Burst(load, None, None)

@@ -48,13 +48,15 @@ def how_sent(spec: MailboxSpec) -> InterruptSpec:
 
 def sent_ns(spec: MailboxSpec, clock_ns: int) -> int:
     """Return the time from the tick from which a message is visible, at the earliest, to the
-    instant at which it was sent; negative."""
+    instant at which it was sent; negative.
+    """
     return how_sent(spec).sent_ns - spec.delay * clock_ns
 
 
 class InterruptWriter(Writer):
     """The one writer of a mailbox under protocol interrupt. Its messages must be written before
-    they are sent."""
+    they are sent.
+    """
 
     def __init__(self, segment: Segment, name: str) -> None:
         super().__init__(segment, name)
@@ -62,14 +64,16 @@ class InterruptWriter(Writer):
 
     def visible_at(self, tick: int, now: int | None) -> int:
         """Return the earliest tick at which the message is visible; a late one is sent in the tick
-        that writes it."""
+        that writes it.
+        """
         released = tick if now is None else max(tick, now - self._due + 1)
         return released + self._delay
 
 
 class InterruptLine:
     """One mailbox that interrupts a board, as that board sees it: the serials served, and the
-    number lost there."""
+    number lost there.
+    """
 
     def __init__(self, segment: Segment, spec: MailboxSpec) -> None:
         self.service_ns = how_sent(spec).service_ns
@@ -89,7 +93,8 @@ class InterruptLine:
     @property
     def found(self) -> int:
         """Serial of the newest message that a reader is to judge: served, lost on its way, or not
-        its writer's."""
+        its writer's.
+        """
         served = self.served
         return max(served[-1] if served else 0, self._missing, self._suspect)
 
@@ -124,7 +129,8 @@ class InterruptLine:
 
     def _accepts(self, serial: int) -> bool:
         """Say whether a message comes from the writer that holds the claim, or from an earlier
-        holder."""
+        holder.
+        """
         slots = self._slots
         if not slots.copy(serial) or not slots.is_lawful(self._signature):
             return False
@@ -134,7 +140,8 @@ class InterruptLine:
 
 class BoardInbox:
     """The inbox of the board in a slot, as one of its tasks works it out. `lines` are its mailboxes
-    by name."""
+    by name.
+    """
 
     def __init__(self, segment: Segment, slot: int) -> None:
         boxes = segment.layout.interrupting(slot)
@@ -207,7 +214,8 @@ class InterruptReader(Reader):
 
     def _step_back(self, serial: int, tick: int) -> Reading[AnyMessage]:
         """Take the newest good message that was served before a lost, damaged or forged one, if it
-        is unread."""
+        is unread.
+        """
         for older in reversed(self._line.served):
             if self.serial < older < serial:
                 if self._obtain(older):

@@ -127,7 +127,8 @@ class Writer:
 
     def is_in_time(self, tick: int, now: int | None) -> bool:
         """Say whether a message released at `tick` and written now comes in time; `now` as in
-        `write`."""
+        `write`.
+        """
         return now is None or now < tick + self._due
 
     def visible_at(self, tick: int, now: int | None) -> int:
@@ -252,7 +253,8 @@ class Reader:
 
     def reading(self, is_new: bool) -> Reading[AnyMessage]:
         """Return the last good message with verdict NEW, or else OLD; NONE before the first
-        message."""
+        message.
+        """
         return self._new if is_new else self._unchanged
 
     def read(self, tick: int) -> Reading[AnyMessage]:
@@ -318,7 +320,8 @@ class Reader:
 
     def _blame(self, serial: int) -> None:
         """Count the fault of the message fetched last. If its slot holds another message, it is
-        lost: not counted."""
+        lost: not counted.
+        """
         slots = self.slots
         if not slots.keeps(serial):
             return
@@ -340,7 +343,8 @@ class Reader:
 
     def with_earlier(self, reading: Reading[AnyMessage], before: int) -> Reading[AnyMessage]:
         """Return a reading with the good messages after serial `before` and before its own, as far
-        as the slots reach back."""
+        as the slots reach back.
+        """
         if self.serial <= before + 1:
             return reading
         return reading._replace(earlier=tuple(self.slots.between(before, self.serial)))

@@ -142,7 +142,8 @@ OBSERVERS: dict[Protocol, type[Reader]] = {**READERS, "lock": DoubleBufferReader
 
 def open_writer(segment: Segment, name: str) -> Writer:
     """Claim a mailbox for writing under its protocol. Raises `MailboxError` when it has a
-    writer."""
+    writer.
+    """
     return WRITERS[segment.layout.mailbox(name).protocol](segment, name)
 
 
@@ -164,5 +165,6 @@ def open_reader(
 
 def open_observer(segment: Segment, name: str) -> Reader:
     """Open a mailbox for reading its newest message at no cost to others: for the clock and the
-    host side."""
+    host side.
+    """
     return OBSERVERS[segment.layout.mailbox(name).protocol](segment, name)

@@ -67,7 +67,8 @@ def is_position(spec: MailboxSpec) -> bool:
 
 def queues_of(layout: Layout) -> list[MailboxSpec]:
     """Return the queues between tasks; the rings of host boards are not by ticks, so they have no
-    position."""
+    position.
+    """
     names = {box.name for box in layout.mailboxes}
     return [
         box for box in layout.mailboxes if box.protocol == "queue" and taken_name(box.name) in names
@@ -109,7 +110,8 @@ class QueueWriter(Writer):
 
     def write(self, tick: int, now: int | None = None, basis: int | None = None) -> bool:
         """Publish the messages sent in the cycle released at `tick`; return False when it is too
-        late for them."""
+        late for them.
+        """
         if not self._pending:
             return True
         if basis is None:
@@ -122,13 +124,15 @@ class QueueWriter(Writer):
 
     def visible_at(self, tick: int, now: int | None) -> int:
         """Return the tick from which messages released at `tick` and written now are visible, lost
-        ones too."""
+        ones too.
+        """
         self._shown_at = super().visible_at(tick, now)
         return self._shown_at
 
     def outgoing(self) -> Iterator[None]:
         """Put each message of the cycle into `message` in turn; the level finds its own content
-        there again."""
+        there again.
+        """
         slots = self.slots
         present = bytes(self.message.raw)
         if self._shared[Box.HEAD] != slots.box[Box.HEAD]:
@@ -147,7 +151,8 @@ class QueueWriter(Writer):
 
     def lose(self) -> None:
         """Publish a serial without its message, as an injected loss does: the reader finds the gap
-        at its tick."""
+        at its tick.
+        """
         slots = self.slots
         slots.heads[(self.serial + 1) & slots.mask][Slot.VISIBLE_AT] = self._shown_at
         slots.lose()
@@ -230,7 +235,8 @@ class QueueReader(Reader):
 
     def _sees(self, serial: int, last: int, tick: int) -> bool:
         """Say whether a message may be read, or is not there to wait for; no good one is visible
-        that far ahead."""
+        that far ahead.
+        """
         if serial > last:
             return False
         ahead = self._heads[serial & self._mask][Slot.VISIBLE_AT] - tick

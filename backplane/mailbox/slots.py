@@ -56,7 +56,8 @@ EPOCH_MASK = (1 << EPOCH_BITS) - 1
 
 def claim(epoch: int, pid: int) -> int:
     """Return a writer's signature: the epoch of its claim and, in the upper half, its process
-    id."""
+    id.
+    """
     return epoch | pid << EPOCH_BITS
 
 
@@ -131,7 +132,8 @@ class Slots:
     @staticmethod
     def fence() -> None:
         """Keep accesses to memory before and after it apart: nothing on x86-64, where a board puts
-        an instruction in its place all the same."""
+        an instruction in its place all the same.
+        """
 
     def resume(self, signature: int) -> None:
         """Continue after the newest published message, as a writer."""
@@ -149,7 +151,8 @@ class Slots:
 
     def clear_unpublished(self) -> None:
         """Empty the slots that a dead writer has filled and not published: no reader may take
-        them for messages of this writer's that are lost."""
+        them for messages of this writer's that are lost.
+        """
         head = self.box[Box.HEAD] & (UNSIGNED >> 1)
         for words in self.heads:
             if words[_SERIAL] > head:
@@ -197,7 +200,8 @@ class Slots:
 
     def keeps(self, serial: int) -> bool:
         """Say whether that serial's slot has not been reused: a copy made before this call is then
-        of that message."""
+        of that message.
+        """
         self.fence()
         return serial >= oldest_kept(self.box[0], self.depth)
 

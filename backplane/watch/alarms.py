@@ -193,7 +193,8 @@ class Episodes:
         self, code: Alarm, access: int, tick: int, value: float = 0.0, since: int | None = None
     ) -> None:
         """Note a finding in an access, counted by the caller; raise the alarm if it begins an
-        episode."""
+        episode.
+        """
         if not self.is_open(code, access, tick):
             self.ring(code, tick, value, since)
         self._last[code] = access, tick

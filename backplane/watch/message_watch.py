@@ -157,7 +157,8 @@ class MessageWatch:
 
 class QueueWatch(MessageWatch):
     """Judges the messages that the reader of a queue has taken, several of one release among
-    them."""
+    them.
+    """
 
     def __init__(self, segment: Segment, reader: QueueReader, episodes: Episodes) -> None:
         super().__init__(segment, reader, episodes)

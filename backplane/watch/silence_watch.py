@@ -76,7 +76,8 @@ class SilenceWatch(MessageWatch):
 
     def is_lost(self, tick: int) -> bool:
         """Say whether the writer is lost or has been silent for too long; raise an alarm if the
-        cause is proven."""
+        cause is proven.
+        """
         if max_age := self._reader.spec.max_age:
             box = self._slots.box
             is_old = tick - self._reader.basis > max_age and not is_on(box[Box.KEPT], tick)
@@ -104,7 +105,8 @@ class SilenceWatch(MessageWatch):
 
     def _is_mute(self, tick: int) -> bool:
         """Say whether the writer has finished a release that writes a message, and the newest is of
-        an earlier one."""
+        an earlier one.
+        """
         accesses = self._reader.accesses
         if any(
             self._episodes.is_open(code, accesses, tick)

@@ -1,5 +1,6 @@
 """Readers that watch their mailbox: every read also checks for damaged, late, forged and missing
-messages."""
+messages.
+"""
 
 from __future__ import annotations
 
@@ -58,7 +59,8 @@ class Watched(ABC):
     @abstractmethod
     def read(self, tick: int) -> Reading[AnyMessage]:
         """Return the newest message visible at `tick`, with its verdict, and whether its writer is
-        lost."""
+        lost.
+        """
 
     @abstractmethod
     def is_writer_lost(self, tick: int) -> bool:
@@ -71,7 +73,8 @@ class Watched(ABC):
 
     def _report(self, tick: int) -> None:
         """Count the last read, a bad one, for the task; raise alarms for a damaged or forged
-        message."""
+        message.
+        """
         found = self._statistics
         accesses = self.reader.accesses
         self._task.troubles += 1
@@ -98,7 +101,8 @@ class WatchedReader(Watched):
 
     def read(self, tick: int) -> Reading[AnyMessage]:
         """Return the newest message visible at `tick`, with its verdict, and whether its writer is
-        lost."""
+        lost.
+        """
         reader = self.reader
         reading = reader.read(tick)
         return self.conclude(
@@ -143,7 +147,8 @@ class SporadicReader(Watched):
 
     def read(self, tick: int) -> Reading[AnyMessage]:
         """Return the newest message visible at `tick`, with its verdict, and the unread ones before
-        it."""
+        it.
+        """
         before = self.reader.serial
         reading = self.reader.read(tick)
         if self._has_trouble:
@@ -211,7 +216,8 @@ class GridReader:
 
     def read(self, tick: int) -> Reading[AnyMessage]:
         """Return the newest message visible at `tick` if it is due, otherwise that of the last
-        read."""
+        read.
+        """
         if (tick - self._phase) % self._every == 0:
             reading = self._watched.read(tick)
             self._was_lost = reading.is_lost

@@ -1,5 +1,6 @@
 """Operator commands: what a level takes, with which goal, and their requests in the operator
-table."""
+table.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +39,8 @@ DOWN = (0.0, 0.0, -1.0)
 
 def takes(level: PublishedLevel) -> str:
     """Return the commands that a level takes as text, with the names that it knows: "hold, resume,
-    table saw|slow"."""
+    table saw|slow".
+    """
     words = []
     for what, goals in level.commands.items():
         names = "|".join(level.wording.get(what, ()))
@@ -49,7 +51,8 @@ def takes(level: PublishedLevel) -> str:
 
 def asked(given: Mapping[str, Any]) -> CommandConfig:
     """Return the command in a mapping, as in a `[[command]]` table. Raises `ConfigError` with every
-    mistake."""
+    mistake.
+    """
     try:
         return CommandConfig.model_validate(given)
     except ValidationError as error:

@@ -297,7 +297,8 @@ class Wiring:
     @cached_property
     def unknown(self) -> set[str]:
         """Boards with mistakes of their own: a reader that lacks a mailbox of theirs is not at
-        fault."""
+        fault.
+        """
         found = {place.board for place in self.missing}
         found |= {ports.place.board for ports in self.ports.values() if not ports.is_whole}
         found |= {place.removeprefix("board.").removeprefix("host.") for place in self.broken}

@@ -1,5 +1,6 @@
 """Config files: found by name or path, merged with the files that they extend, with absolute
-paths."""
+paths.
+"""
 
 from __future__ import annotations
 
@@ -50,7 +51,8 @@ def assembled(
     name_or_path: str | Path, overrides: Sequence[str], faults: str | Path | None
 ) -> Assembled:
     """Return the tables of a config by name or path, with `key.sub=value` overrides and the faults
-    of a script. Paths in an override are relative to the current folder."""
+    of a script. Paths in an override are relative to the current folder.
+    """
     mistakes: list[Mistake] = []
     tables: Tables = {}
     folder = CONFIGS
@@ -81,7 +83,8 @@ def gathering(mistakes: list[Mistake]) -> Iterator[None]:
 
 def named_classes(tables: Tables) -> tuple[str, ...]:
     """Return the classes of levels that tables name, as "package.module:Class"; nothing else in
-    them is checked."""
+    them is checked.
+    """
     boards = [board for board in _table(tables, "board").values() if isinstance(board, dict)]
     names = [board.get(role) for board in boards for role in ("executor", "planner")]
     names += [LAN_ADAPTER] if "lan" in _table(tables, "adapter") else []
@@ -131,7 +134,8 @@ def names(folder: Path = CONFIGS) -> list[str]:
 
 def file_at(path: Path) -> Path | None:
     """Return the absolute path of a file, which need not be a regular one; None if it does not
-    exist or the path is invalid (unknown ~user)."""
+    exist or the path is invalid (unknown ~user).
+    """
     try:
         path = path.expanduser()
         if path.is_file():
@@ -144,7 +148,8 @@ def file_at(path: Path) -> Path | None:
 
 def anchor(tables: Tables, folder: Path) -> Tables:
     """Return the tables with absolute paths, resolved from `folder`, or for a bundled file from
-    configs/."""
+    configs/.
+    """
 
     def find(text: str) -> str:
         return str(_find(text, folder) or folder / text)
@@ -160,7 +165,8 @@ def anchor(tables: Tables, folder: Path) -> Tables:
 
 def with_texts(value: Any, keys: Sequence[str], change: Callable[[str], str]) -> Any:
     """Return tables with `change` applied to the text at a place, or to each text of a list there;
-    whatever else is there stays."""
+    whatever else is there stays.
+    """
     if keys and isinstance(value, dict):
         key, *rest = keys
         return {
@@ -239,7 +245,8 @@ def _merged(
 
 def _extended(base: Tables, top: Tables) -> Tables:
     """Return a file's tables merged over those it extends; a [robot] with its own model replaces
-    the arm."""
+    the arm.
+    """
     if "model" in _table(top, "robot"):
         base = {key: value for key, value in base.items() if key != "robot"}
     return merge(base, top)
@@ -277,5 +284,6 @@ def _named(name: str, folder: Path = CONFIGS) -> Path | None:
 
 def _find(reference: str, folder: Path) -> Path | None:
     """Return the file that a config in `folder` refers to: next to it, else among the bundled
-    ones."""
+    ones.
+    """
     return file_at(folder / reference) or file_at(CONFIGS / reference)

@@ -1,5 +1,6 @@
 """Faults: whether their kind, their target and their time fit each other and the rack, and their
-entries in the fault table."""
+entries in the fault table.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
 """From the wiring of a rack to its layout: all mailboxes and tasks, as plain data for its
-segment."""
+segment.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +42,8 @@ NS_PER_MS = 1e6
 
 def obtained_core(core: int) -> int:
     """Return the core for a task that requests `core`; cores that the machine lacks map to the
-    others in turn."""
+    others in turn.
+    """
     available = sorted(os.sched_getaffinity(0))
     return core if core in available else available[core % len(available)]
 
@@ -62,7 +64,8 @@ def shared_out(config: RackConfig) -> list[str]:
 
 def exchanges(wiring: Wiring, ports: TaskPorts) -> dict[str, ExchangeSpec]:
     """Return how an executor reads the ports listed in its board's table, by port; times in
-    ticks."""
+    ticks.
+    """
     board = ports.place.board
     every = wiring.every[board]
     phase = wiring.config.board[board].phase
@@ -99,7 +102,8 @@ class LayoutMaker:
 
     def _written(self, name: str) -> Iterator[MailboxSpec]:
         """Yield a mailbox that a task or host board writes; with a queue the one of its reader's
-        position."""
+        position.
+        """
         ports, output = self._wiring.writers[name]
         capacity = self._config.protocol.depth.get(name, UNREAD)
         if name in self._wiring.from_host:
@@ -142,7 +146,8 @@ class LayoutMaker:
         self, box: MailboxSpec, capacity: int, reader: TaskSpec, writer: TaskSpec
     ) -> Iterator[MailboxSpec]:
         """Yield a queue with its size, and the mailbox in which its reader writes its position for
-        the writer."""
+        the writer.
+        """
         delay = reader.slice
         read = max((exchange.grid for exchange in box.exchanges), default=reader.grid)
         # From its release until it can know what the reader has taken, the writer can send no more
@@ -235,7 +240,8 @@ class LayoutMaker:
 
     def _mailbox(self, name: str, kind: MessageType | None = None, **given: Any) -> MailboxSpec:
         """Return the record of a mailbox: its message, readers and protocol, and the other fields
-        as given. `kind`: its message type, of a mailbox that is no port's."""
+        as given. `kind`: its message type, of a mailbox that is no port's.
+        """
         wiring = self._wiring
         kind = kind or wiring.types[name]
         reading = wiring.reading.get(name, ())
@@ -258,7 +264,8 @@ class LayoutMaker:
 
 def field_specs(kind: MessageType, sizes: Mapping[str, int]) -> tuple[FieldSpec, ...]:
     """Return the fields of a message type with offsets, shapes and numpy types, for tools that
-    attach by name."""
+    attach by name.
+    """
     offsets: Mapping[str, Any] = kind.dtype(sizes).fields or {}
     specs = []
     for field in kind.fields:

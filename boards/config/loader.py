@@ -42,7 +42,8 @@ def load(
 
 def loads(text: str) -> RackConfig:
     """Return the config in TOML text, as `RackConfig.text` writes it, and add its levels to the
-    import path. Raises `ConfigError` as `load` does."""
+    import path. Raises `ConfigError` as `load` does.
+    """
     return validated(Assembled(anchor(parse(text), CONFIGS)))
 
 
@@ -100,7 +101,8 @@ def validated(found: Assembled) -> RackConfig:
 
 def _readable(tables: Tables, key: str, kind: type[T]) -> Iterator[tuple[str, T]]:
     """Yield place and table for the valid tables of a list; the mistakes of the others are already
-    known."""
+    known.
+    """
     entries = tables.get(key)
     if not isinstance(entries, list):
         return
@@ -129,7 +131,8 @@ def _intact(tables: Tables, broken: frozenset[str]) -> RackConfig:
 
 def _with_derived(config: RackConfig) -> RackConfig:
     """Return a config whose arm has joints, tool and home, its model's where it says nothing.
-    Raises `ConfigError`."""
+    Raises `ConfigError`.
+    """
     robot = config.robot
     if robot is None or (robot.joints and robot.tool and robot.home):
         return config

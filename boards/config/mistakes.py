@@ -26,7 +26,8 @@ def mistakes_of(
     error: ValidationError, model: type[BaseModel], tables: Any, place: str = ""
 ) -> list[Mistake]:
     """Return the mistakes of `tables`, which are at `place` in the config and failed validation as
-    `model`."""
+    `model`.
+    """
     found = [_mistake(entry, model, tables, place) for entry in error.errors(include_url=False)]
     # A value that may have several types yields a mistake for each type: keep the first, or that of
     # its item.
@@ -83,7 +84,8 @@ def _declared(
     model: type[BaseModel], keys: list[int | str], table: Any
 ) -> tuple[list[str], FieldInfo | None]:
     """Return the names of all keys of the table that contains the last of `keys`, and that key's
-    field."""
+    field.
+    """
     models = [model]
     known = dict[str, FieldInfo]()
     field = None
@@ -108,7 +110,8 @@ def _declared(
 
 def _fits(kind: type[BaseModel], table: Any) -> bool:
     """Say whether a table may be of this kind, judged by its keys with fixed values, as in do =
-    "goto"."""
+    "goto".
+    """
     fixed = {
         key: get_args(f.annotation)
         for key, f in kind.model_fields.items()
@@ -140,5 +143,6 @@ def repeats(names: Iterable[str]) -> Iterator[tuple[str, int]]:
 
 def at_key(place: str, key: str) -> str:
     """Return the place of a key of a table; what was not given in a config has no place of its
-    own."""
+    own.
+    """
     return f"{place}.{key}" if place else key

@@ -15,7 +15,8 @@ Stretch = Annotated[float, Field(ge=1, le=1e6, allow_inf_nan=False), BeforeValid
 
 class RecordConfig(Table):
     """`[record]`: with `keep`, a flight recorder, which keeps the last stretch of a run, and for
-    good what surrounds a fault, a detection, a miss, a hold, a restart or a lost row."""
+    good what surrounds a fault, a detection, a miss, a hold, a restart or a lost row.
+    """
 
     keep: Stretch | None = None
     """last stretch kept, s; simulated time; also as in "10 min" or "30 s"; default: all"""

@@ -75,7 +75,8 @@ class DescribedSchema(GenerateJsonSchema):
 
 def key_tables(config: RackConfig) -> list[KeyTable]:
     """Return every table that a config of these boards may contain. Raises `ConfigError` for a
-    missing class."""
+    missing class.
+    """
     wiring = Wiring(config)
     if mistakes := [*ports(wiring), *exchange(wiring)]:
         raise ConfigError(mistakes)
@@ -99,7 +100,8 @@ def key_tables(config: RackConfig) -> list[KeyTable]:
 
 def find_tables(name: str, config: RackConfig) -> list[KeyTable]:
     """Return the table `name`, or all whose names begin with it. Raises `LookupError` with the
-    existing tables."""
+    existing tables.
+    """
     known = {found.name: found for found in key_tables(config)}
     parts = name.strip("[]").split(".")
     tables = [".".join(parts)]
@@ -181,7 +183,8 @@ def _key(name: str, entry: Schema, is_required: bool) -> Key:
 
 def _values(entry: Schema) -> tuple[str, list[str]]:
     """Return the type of a value, and the permitted values of each of its alternatives that has
-    limits; of a list or table of like items, those of the items."""
+    limits; of a list or table of like items, those of the items.
+    """
     kinds = []
     limits = []
     for option in entry.get("anyOf", [entry]):
@@ -244,7 +247,8 @@ def _findings(board: str, kinds: Mapping[str, FindingKind]) -> KeyTable:
 
 def _fault_kinds() -> Iterator[KeyTable]:
     """Yield a table for every kind of fault with parameters: the keys of its `[[fault]]` besides
-    the common ones."""
+    the common ones.
+    """
     for kind in KINDS:
         keys = [
             Key(

@@ -68,7 +68,8 @@ LAYOUT_NEEDS = {"clock", "protocol", "robot", "scene", "task"}
 
 def resolve(config: RackConfig) -> Resolved:
     """Check and wire a config to run on this machine, now. Raises `ConfigError` with every
-    mistake."""
+    mistake.
+    """
     network = network_rules(config)
     further = () if network is None else network.credential_mistakes(config)
     return _examined(config, further).resolved()
@@ -76,7 +77,8 @@ def resolve(config: RackConfig) -> Resolved:
 
 def wire(config: RackConfig) -> Layout:
     """Return the layout of a config, which may have run elsewhere. Raises `ConfigError` with every
-    mistake."""
+    mistake.
+    """
     return _examined(config).resolved().layout
 
 
@@ -122,7 +124,8 @@ class Resolved:
 
     def clock(self, seconds: float | None) -> ClockWiring:
         """Return the clock's wiring for a run of `seconds` of simulated time; None: until the task
-        ends."""
+        ends.
+        """
         config = self.config
         clock = config.clock
         ends_run = self.ends_run
@@ -167,13 +170,15 @@ class Resolved:
     @property
     def crate_priority(self) -> int:
         """SCHED_FIFO priority of the crate: below all real-time boards, above all ordinary
-        processes."""
+        processes.
+        """
         priorities = [t.priority for t in self.layout.tasks if t.priority and t.role == "executor"]
         return max(min(priorities, default=0) - 1, 0)
 
     def notes(self, segment: Segment) -> list[str]:
         """Return notes for the launch to report: cores replaced, priorities refused, idle cores
-        held awake, ..."""
+        held awake, ...
+        """
         refused = self._refused(segment)
         found = [*self.config.changed, *shared_out(self.config)]
         if (network := network_rules(self.config)) is not None:

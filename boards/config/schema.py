@@ -121,7 +121,8 @@ class TimingConfig(Table):
 
 class ScheduleConfig(Table):
     """`[schedule]`: a static cyclic schedule, in which every board has its place; see
-    `rack.boards.timing.frames`."""
+    `rack.boards.timing.frames`.
+    """
 
     minor_ms: Positive
     """minor frame, ms; a whole number of ticks, of which every board's cycle is a multiple"""
@@ -150,7 +151,8 @@ class BudgetConfig(Table):
 
 class TransferConfig(Table):
     """`[board.<name>.transfer]`: minimum processor times of bus accesses, to emulate a slower
-    bus."""
+    bus.
+    """
 
     read_ms: Milliseconds = 0.0
     """R: the executor reads commands and statuses, per cycle, ms"""
@@ -164,7 +166,8 @@ class TransferConfig(Table):
 
 class ExchangeConfig(Table):
     """`[board.<name>.exchange.<port>]`: when the executor reads one of its ports; default: in every
-    cycle."""
+    cycle.
+    """
 
     every: int = Field(1, ge=1, le=LONGEST_EVERY)
     """read in every n-th cycle; in between, the last message stays"""
@@ -176,7 +179,8 @@ class ExchangeConfig(Table):
 
 class SupervisionConfig(Table):
     """`[supervision]`: restarts of boards that die or hang, and the cycles that a level may lose.
-    When no restarts are left, the brakes stay engaged."""
+    When no restarts are left, the brakes stay engaged.
+    """
 
     restarts: Restarts = 5
     """maximum number of restarts of one task within within_s; 0: never restart"""
@@ -270,7 +274,8 @@ LAN = "lan"
 
 class LanConfig(PlacedConfig, LanTable):
     """`[adapter.lan]`: the board that exchanges mailboxes with other racks: see
-    `rack.boards.lan.adapter`."""
+    `rack.boards.lan.adapter`.
+    """
 
     rate_hz: Positive = Field(50.0, ge=1e-6)
     """rate of the board, Hz; must divide the clock rate"""
@@ -295,7 +300,8 @@ class AdapterConfig(Table):
 
 class HostConfig(Table):
     """`[host.<name>]`: one board of the host side, without slot, rate and priority: see
-    `rack.levels.host_program`."""
+    `rack.levels.host_program`.
+    """
 
     program: ClassName
     """class of the program, package.module:Class"""
@@ -377,7 +383,8 @@ class CommandConfig(Table):
 
 class TaskPlace(NamedTuple):
     """A task's place in the config: class, slot, requested core and SCHED_FIFO priority; that of a
-    host board."""
+    host board.
+    """
 
     name: str
     board: str
@@ -478,7 +485,8 @@ class RackConfig(Table):
 
     def every(self, board: str) -> int:
         """Return the period of a board's executor, ticks. Raises `ClockError` if it is off the
-        grid."""
+        grid.
+        """
         config = self.board[board]
         if config.every is not None:
             return config.every
@@ -486,7 +494,8 @@ class RackConfig(Table):
 
     def links(self) -> Iterator[tuple[str, str]]:
         """Yield board above and board below of every two neighbours, whichever of them names the
-        other."""
+        other.
+        """
         listed = [(name, lower) for name, board in self.board.items() for lower in board.below]
         listed += [(upper, name) for name, board in self.board.items() for upper in board.above]
         yield from (
@@ -521,7 +530,8 @@ class RackConfig(Table):
 
     def hosts(self) -> Iterator[TaskPlace]:
         """Yield every board of the host side, outside the crate: it has no slot, and runs on any
-        core."""
+        core.
+        """
         for name, host in self.host.items():
             yield TaskPlace(name, name, "host", host.program, OUTSIDE, ANY_CORE, 0)
 

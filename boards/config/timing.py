@@ -36,7 +36,8 @@ def rack_timing(
     config: RackConfig, layout: Layout, found: Mapping[str, Budget] | None = None
 ) -> RackTiming:
     """Return the timing model's record of a rack, with the budgets `found`, by board; default: the
-    config's own."""
+    config's own.
+    """
     found = budgets(config) if found is None else found
     goal_ms = config.timing.response_ms
     clock_cost_ns = round(config.timing.clock_ms * NS_PER_MS)
@@ -81,7 +82,8 @@ def inboxes(layout: Layout) -> dict[str, InboxTiming]:
 
 def without_interrupts(timing: RackTiming, found: Mapping[str, Budget]) -> dict[str, Budget]:
     """Return budgets measured in a run, by board, without what interrupts took; in lockstep they
-    take nothing."""
+    take nothing.
+    """
     if timing.is_lockstep:
         return dict(found)
     return {
@@ -122,7 +124,8 @@ def _board(config: RackConfig, layout: Layout, name: str, budget: Budget | None)
 
 def _reads(layout: Layout, board: str) -> dict[str, TickGrid]:
     """Return the ticks at which an executor reads the messages of others, by writer, if not in
-    every cycle."""
+    every cycle.
+    """
     found: dict[str, TickGrid] = {}
     for box in layout.mailboxes:
         for exchange in box.exchanges:
@@ -133,7 +136,8 @@ def _reads(layout: Layout, board: str) -> dict[str, TickGrid]:
 
 def reservation(config: RackConfig, busy_ms: float, every: int) -> Reservation | None:
     """Return what a board that computes so long in `every` ticks reserves of its processor, ms;
-    None: it asks for a priority."""
+    None: it asks for a priority.
+    """
     if config.clock.scheduler == "fixed-priority" or config.is_lockstep or not busy_ms:
         return None
     period_ns = every * config.tick_ns
@@ -149,7 +153,8 @@ def first_tick(entry: CommandConfig | FaultConfig, clock_ns: int) -> int:
 
 def is_critical(config: RackConfig, layout: Layout, board: str) -> bool:
     """Say whether a board's plan update is the paper's critical section: tightly coupled, under
-    protocol lock."""
+    protocol lock.
+    """
     return (
         config.board[board].coupling == "tight"
         and layout.mailbox(f"{board}.plan").protocol == "lock"

@@ -23,7 +23,8 @@ Tables = dict[str, Any]
 
 def parse(text: str, place: str = "config") -> Tables:
     """Return the tables of TOML text. Raises `ConfigError` with the invalid line, or every value
-    out of bounds."""
+    out of bounds.
+    """
     try:
         tables = load_toml(text)
     except tomllib.TOMLDecodeError as error:

@@ -1,5 +1,6 @@
 """Alarms of tasks and clock as events: with names and units, as text for people and codes for
-programs."""
+programs.
+"""
 
 from __future__ import annotations
 

@@ -51,7 +51,8 @@ def remove_dead(rack: str) -> bool:
 
 def remove_own(rack: str | None = None, killed: Collection[int] = ()) -> None:
     """Remove the racks launched by this process or by one that it has `killed`, or one of them, in
-    any state."""
+    any state.
+    """
     for name in racks() if rack is None else [rack]:
         with suppress(SegmentError):
             segment = Segment.open(name)
@@ -64,7 +65,8 @@ def remove_own(rack: str | None = None, killed: Collection[int] = ()) -> None:
 
 def clean() -> tuple[list[str], list[str], list[str]]:
     """Remove every rack that is not running; return names removed, names in use, and a line per
-    foreign entry."""
+    foreign entry.
+    """
     removed = []
     in_use = []
     strange = []

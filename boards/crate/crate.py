@@ -198,7 +198,8 @@ class Crate:
 
     def _preload(self, wanted: Preload) -> None:
         """Load what boards share with the crate. Mistakes in the config are left for the Rack to
-        report."""
+        report.
+        """
         sys.path[:] = wanted.path
         compiled.on_compile = lambda function: self._line.send(Compiling(function))
         load_machine_code()
@@ -262,7 +263,8 @@ class Crate:
 
     def _end_orphans(self) -> None:
         """End whatever a host board has started, in any session: with its end it has become a child
-        of the crate."""
+        of the crate.
+        """
         deadline = time.monotonic() + ORPHANS_S
         while time.monotonic() < deadline:
             boards = {pid for _, pid in self._boards.values()}
@@ -275,7 +277,8 @@ class Crate:
 
     def _mark_lost(self, name: str) -> int:
         """Mark a board as lost on the backplane, for the clock and the other boards; return the
-        tick."""
+        tick.
+        """
         words = self._segment.words
         tick = words[System.TICK]
         if name in self._segment.map.blocks and words[System.STATE] != Run.STOPPED:
@@ -308,7 +311,8 @@ class Crate:
 
     def _leave(self) -> None:
         """Leave a rack whose Rack is gone, or wants that: boards notice it and end; those that take
-        too long are killed."""
+        too long are killed.
+        """
         deadline = time.monotonic() + LEAVE_S
         for pidfd, (name, _) in self._boards.items():
             if self._is_host(name):
@@ -341,7 +345,8 @@ class Crate:
 
     def _reap_ended(self, timeout_s: float | None, *others: Source) -> Collection[object]:
         """Reap boards that end, and take notes of others, until something happens; return what was
-        ready of these and of `others`."""
+        ready of these and of `others`.
+        """
         ready = wait([self._shelf.line, *self._boards, *others], timeout_s)
         for pidfd in [pidfd for pidfd in self._boards if pidfd in ready]:
             seen_ns = time.monotonic_ns()

@@ -73,7 +73,8 @@ class Heartbeat:
 
     def _clock_is_stuck(self) -> bool:
         """Say whether a silent clock is stopped, dead or waiting; one that is runnable is merely
-        starved."""
+        starved.
+        """
         state = state_of(self._words[System.CLOCK_PID])
         tick = self._seen[CLOCK][0]
         # Must be seen twice: after a pause of the whole machine the clock is about to be woken.

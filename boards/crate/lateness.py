@@ -78,6 +78,7 @@ def _count_releases(task: TaskSpec, spans: Iterable[tuple[int, int]]) -> int:
 
 def _permit(due: int, fraction: float, plan: int) -> int:
     """Return how many of the cycles due may be lost: the fraction, rounded up so that one late
-    cycle, or plan, does not fail a short run; but not all of them."""
+    cycle, or plan, does not fail a short run; but not all of them.
+    """
     most = plan * math.ceil(fraction * due / plan)
     return most if fraction == 1 else max(0, min(most, due - 1))

@@ -109,7 +109,8 @@ class CrateLine:
 
     def close(self, timeout_s: float) -> None:
         """Close the line, which makes the crate end its boards and itself; kill it after the
-        timeout."""
+        timeout.
+        """
         if self._is_closed:
             return
         self._is_closed = True
@@ -164,7 +165,8 @@ class WarmCrate(CrateLine):
 
     def show(self, tick: int, task: str) -> Shown:
         """Return the tick of the last snapshot at `tick` or before, -1 without one, and the
-        attributes of the level of a task there; none without a task."""
+        attributes of the level of a task there; none without a task.
+        """
         self.ask(Show(tick, task))
         answer: object = self
         while answer is not None and not isinstance(answer, Shown):
@@ -178,7 +180,8 @@ class WarmCrate(CrateLine):
 
 def environment() -> dict[str, str]:
     """Return the environment of the crate and its boards: the Rack's own, with settings that make
-    runs repeatable."""
+    runs repeatable.
+    """
     tunables = ":".join(filter(None, (os.environ.get(TUNABLES), SAME_LIBM)))
     return {
         **os.environ,

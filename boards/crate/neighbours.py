@@ -25,7 +25,8 @@ from rack.boards.config.schema import RackConfig
 @dataclass(frozen=True)
 class Holder:
     """A rack that occupies a core, and its tasks there. Of another user's rack, `process` is one of
-    the boards, otherwise the launcher."""
+    the boards, otherwise the launcher.
+    """
 
     rack: str
     process: str
@@ -93,7 +94,8 @@ def _held(segment: Segment) -> dict[int, list[str]]:
 
 def placed(config: RackConfig, held: Mapping[int, Holder]) -> tuple[RackConfig, list[str]]:
     """Return the config with boards moved off occupied cores, unless it names their core, and a
-    note on each move."""
+    note on each move.
+    """
     free = [core for core in sorted(os.sched_getaffinity(0)) if core not in held]
     if not free or config.clock.mode == "lockstep":
         return config, []
@@ -114,7 +116,8 @@ def placed(config: RackConfig, held: Mapping[int, Holder]) -> tuple[RackConfig, 
 
 def conflicts(config: RackConfig, held: Mapping[int, Holder]) -> list[str]:
     """Return a line for every core that another rack occupies and a real-time task of this config
-    requests."""
+    requests.
+    """
     tasks = [
         (CLOCK, config.clock.core, config.clock.priority),
         *((t.name, t.core, t.priority) for t in config.tasks()),

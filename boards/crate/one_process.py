@@ -102,7 +102,8 @@ class OneProcess:
 
     def newest(self, mailbox: str) -> AnyMessage:
         """Return a copy of the newest message that was visible in the last tick. Raises
-        `LookupError`: there was none, or no such mailbox."""
+        `LookupError`: there was none, or no such mailbox.
+        """
         post = self._posts.get(mailbox)
         if post is None:
             raise LookupError(f"no mailbox '{mailbox}'; there are: {', '.join(self._posts)}")
@@ -122,7 +123,8 @@ class OneProcess:
 
 class Post:
     """One mailbox: `message` to fill, and the messages written so far that a reader may still
-    need."""
+    need.
+    """
 
     def __init__(self, spec: MailboxSpec) -> None:
         self.spec = spec
@@ -134,7 +136,8 @@ class Post:
 
     def write(self, tick: int, cycle: int) -> None:
         """Write the message in the cycle of `cycle` ticks released at `tick`, if this is one that
-        writes it."""
+        writes it.
+        """
         if not (tick + cycle - self.spec.phase) % self.spec.every:
             self.serial += 1
             self.kept.append((tick + self.spec.delay, self.serial, bytes(self.message.raw)))

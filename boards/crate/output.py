@@ -1,5 +1,6 @@
 """What host boards print: lines of bounded length, of each board as many as a run keeps; the others
-are counted."""
+are counted.
+"""
 
 from __future__ import annotations
 
@@ -17,13 +18,15 @@ _LINE = re.compile(rb"[^\n]{%d}\n?|[^\n]*\n" % LONGEST_LINE)
 
 def lines_of(data: bytes) -> list[bytes]:
     """Return the lines that are whole or cut, with their ends; the rest is a line that has not
-    ended."""
+    ended.
+    """
     return _LINE.findall(data)
 
 
 class HostOutput:
     """The pipe into which all processes of one host board print. The crate empties it to its own
-    stdout."""
+    stdout.
+    """
 
     def __init__(self, board: str) -> None:
         self._board = board
@@ -40,7 +43,8 @@ class HostOutput:
 
     def pass_on(self, is_over: bool = False) -> None:
         """Pass on what has come; say what was dropped each time that it has doubled, and when the
-        board `is_over`."""
+        board `is_over`.
+        """
         with suppress(BlockingIOError):
             self._rest += os.read(self.reader, MOST_READ)
         if is_over and self._rest[-1:] not in b"\n":

@@ -1,5 +1,6 @@
 """Waits, with a line to the user when they take long: during a launch, and in lockstep for another
-rack."""
+rack.
+"""
 
 from __future__ import annotations
 
@@ -58,7 +59,8 @@ class Patience:
 
 class RackAwaited:
     """Reports for which other rack an adapter waits in lockstep, which may take as long as it
-    wants."""
+    wants.
+    """
 
     def __init__(self, segment: Segment, journal: Journal) -> None:
         self._segment = segment

@@ -178,7 +178,8 @@ class Rack:
 
     def _inject(self, plan: Resolved, crate: CrateLine) -> None:
         """Fill the tables with the config's faults and commands; start the faults that are
-        processes."""
+        processes.
+        """
         table = FaultTable(self.segment)
         before = self._continues or Continuation(0)
         for injection in plan.faults[before.faults :]:
@@ -194,12 +195,14 @@ class Rack:
 
     def follow(self, events: Iterable[Event]) -> None:
         """Take over the events of the run that this one continues, from before its snapshot: the
-        outcome counts them."""
+        outcome counts them.
+        """
         self._journal.events.extend(events)
 
     def start(self, seconds: float | None = None) -> None:
         """Power on the clock, which begins the run. It lasts `seconds` of simulated time, or until
-        the task ends."""
+        the task ends.
+        """
         supervisor = self._supervisor
         plan = supervisor.plan
         clock = plan.clock(seconds)
@@ -263,7 +266,8 @@ class Rack:
 
     def watch(self, timeout_s: float) -> bool:
         """Supervise the boards for `timeout_s` or until the run is over; return False when it is
-        over."""
+        over.
+        """
         return self._supervisor.watch(timeout_s)
 
     def stop(self, why: str = "stopped by its program") -> None:

@@ -29,7 +29,8 @@ UP = (TaskState.READY, TaskState.RUNNING)
 
 class Supervision:
     """The restart policy of a rack. It counts in ticks, so that in lockstep the same losses have
-    the same outcome."""
+    the same outcome.
+    """
 
     def __init__(self, config: RackConfig, layout: Layout) -> None:
         self._config = config
@@ -46,7 +47,8 @@ class Supervision:
 
     def admit(self, task: str, tick: int) -> str:
         """Count one more restart of a task, lost at `tick`; return which one it is, as text, empty
-        if no more are permitted."""
+        if no more are permitted.
+        """
         common = self._config.supervision
         most, within_s = common.restarts, common.within_s
         if task != CLOCK:
@@ -63,13 +65,15 @@ class Supervision:
 
     def in_order(self, tasks: list[str]) -> list[str]:
         """Return the tasks in order of restart: the clock, then lower levels before higher,
-        executor before planner."""
+        executor before planner.
+        """
         # A task always needs more than any task that it needs, so sorting by count is enough.
         return sorted(tasks, key=lambda task: len(self._needs[task]))
 
     def must_wait(self, task: str, absent: list[str]) -> bool:
         """Say whether a task on which this one depends is still absent: any below it, or a
-        planner's executor."""
+        planner's executor.
+        """
         return not self._needs[task].isdisjoint(absent)
 
 
@@ -160,13 +164,15 @@ class Recovery:
 
     def end_hanging(self, board: str) -> None:
         """Kill a hanging board, which is then lost like any other; one that is being restarted is
-        left alone."""
+        left alone.
+        """
         if board not in (*self._waiting, *self._starting):
             self._crate.ask(PowerOff(board))
 
     def advance(self) -> None:
         """Power on the boards that are due, and end host boards that a signal has stopped: nothing
-        else shows that one hangs."""
+        else shows that one hangs.
+        """
         self._starting = [
             name
             for name in self._starting

@@ -110,7 +110,8 @@ class PreloadFailed:
 @dataclass(frozen=True)
 class Opened:
     """Answer to `Open`: the `tick` of the snapshot from which the rack goes on; -1: there is none,
-    or none was wanted."""
+    or none was wanted.
+    """
 
     tick: int = -1
 

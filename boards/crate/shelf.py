@@ -39,7 +39,8 @@ class WaitingCopy:
 
     def can_be(self, wiring: Wiring) -> bool:
         """Say whether it can be the board of a wiring: it is that of its own, but for the settings
-        of its level."""
+        of its level.
+        """
         before = self.wiring
         if isinstance(before, TaskWiring) and isinstance(wiring, TaskWiring):
             return replace(before, context=wiring.context) == wiring
@@ -48,7 +49,8 @@ class WaitingCopy:
     def go_on(self, wiring: Wiring, rack: str) -> int:
         """Let it go on in the segment of a rack, as a child of this process, with the context in
         `wiring`; return its process. Its successor's note follows. Raises `OSError` if it is
-        gone."""
+        gone.
+        """
         context = None
         if isinstance(wiring, TaskWiring) and wiring != self.wiring:
             context = wiring.context
@@ -151,7 +153,8 @@ class SnapshotShelf:
 
     def _most_dispensable(self) -> HeldSnapshot:
         """Return the snapshot of the older half, in the order in which they were taken, that leaves
-        the smallest gap between its neighbours; never the newest, or the one of the first tick."""
+        the smallest gap between its neighbours; never the newest, or the one of the first tick.
+        """
         held = self._held
         ticks = sorted(snapshot.tick for snapshot in held)
         older = held[: max(2, len(held) // 2)]

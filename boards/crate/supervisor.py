@@ -81,7 +81,8 @@ class Supervisor:
 
     def watch(self, timeout_s: float) -> bool:
         """Supervise the boards for `timeout_s` or until the run is over; return False when it is
-        over."""
+        over.
+        """
         deadline = time.monotonic() + timeout_s
         while self.outcome is None:
             self._listen(min(deadline, self._stop_by or deadline) - time.monotonic())

@@ -38,7 +38,8 @@ def cycle_ticks(layout: Layout, board: str) -> int:
 
 def last_read(mailboxes: tuple[str, ...], layout: Layout) -> int:
     """Return the ticks from the last message in any of these mailboxes until its slowest reader has
-    read it."""
+    read it.
+    """
     boxes = [layout.mailbox(name) for name in mailboxes]
     return max(
         (box.delay + between_reads(layout, box, reader) for box in boxes for reader in box.readers),
@@ -48,7 +49,8 @@ def last_read(mailboxes: tuple[str, ...], layout: Layout) -> int:
 
 def struck_mailboxes(layout: Layout, at: int, board: str) -> tuple[MailboxSpec, ...]:
     """Return the mailboxes that a fault of a task concerns: that with index `at`; -1: all that it
-    writes."""
+    writes.
+    """
     chosen = layout.mailboxes if at < 0 else layout.mailboxes[at : at + 1]
     return tuple(mailbox for mailbox in chosen if mailbox.writer == board)
 
@@ -61,7 +63,8 @@ def between_reads(layout: Layout, mailbox: MailboxSpec, reader: str) -> int:
 @dataclass(frozen=True)
 class BoundCase:
     """The facts about a fault that decide its bound. `reader` is the task that detects it; None:
-    the first to do so."""
+    the first to do so.
+    """
 
     layout: Layout
     injection: Injection
@@ -76,7 +79,8 @@ class BoundCase:
     @cached_property
     def mailboxes(self) -> tuple[MailboxSpec, ...]:
         """The affected mailboxes that the reader reads; without a `reader`, those that any task
-        reads."""
+        reads.
+        """
         struck = struck_mailboxes(self.layout, self.injection.mailbox, self.board)
         if self.reader:
             return tuple(mailbox for mailbox in struck if self.reader in mailbox.readers)
@@ -100,7 +104,8 @@ class BoundCase:
     @property
     def read(self) -> int:
         """Longest time between reads, ticks: by the reader, or by the fastest reader of each
-        mailbox."""
+        mailbox.
+        """
         between = partial(between_reads, self.layout)
         if self.reader:
             return max(
@@ -115,7 +120,8 @@ class BoundCase:
 @dataclass(frozen=True)
 class Bound:
     """A detection bound, as text and in ticks. `ticks` returns None if there is no bound, or if
-    this process knows only the text."""
+    this process knows only the text.
+    """
 
     text: str
     ticks: Callable[[BoundCase], int | None] = lambda case: None
@@ -139,7 +145,8 @@ def counting(number: float, noun: str) -> str:
 
 def cycles(count: int) -> Bound:
     """Return a bound of `count` cycles of the task; 0: the cycle in which the fault strikes. A host
-    board has none."""
+    board has none.
+    """
 
     def ticks(case: BoundCase) -> int | None:
         return None if case.role == "host" else count * case.cycle
@@ -150,7 +157,8 @@ def cycles(count: int) -> Bound:
 
 def cycles_and_time(count: int, time_ns: int) -> Bound:
     """Return a bound of `count` cycles of the task, but at least a time, in which a controller's
-    gains take effect."""
+    gains take effect.
+    """
 
     def ticks(case: BoundCase) -> int:
         return max(count * case.cycle, ceil(time_ns / case.layout.clock_ns))

@@ -232,7 +232,8 @@ class FaultStage:
 
     def within(self, tick: int) -> None:
         """Let the faults with a phase in `tick` strike at their times; call it after the
-        releases."""
+        releases.
+        """
         if not self._phased:
             return
         clock = self.clock

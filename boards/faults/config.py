@@ -72,7 +72,8 @@ class FaultConfig(Table):
 
 def condition(text: str, layout: Layout) -> tuple[int, int, int]:
     """Return a condition as indices of mailbox and field, and a number. Raises `LookupError` with a
-    reason."""
+    reason.
+    """
     found = CONDITION.fullmatch(text)
     if found is None:
         raise LookupError(

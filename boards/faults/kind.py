@@ -115,7 +115,8 @@ class Kind:
     @property
     def number(self) -> int:
         """Number of the kind in the fault table, derived from its name so that all processes
-        agree."""
+        agree.
+        """
         return crc32(self.name.encode())
 
     @property
@@ -202,7 +203,8 @@ class Kinds:
 
     def add(self, *kinds: Kind) -> None:
         """Add kinds. Raises `ValueError` for a name or number in use, or for too many
-        parameters."""
+        parameters.
+        """
         for kind in kinds:
             if kind.number in self._by_number:
                 raise ValueError(
@@ -230,7 +232,8 @@ class Kinds:
 
     def __getitem__(self, key: str | int) -> Kind:
         """Return the kind of a name, or of a number in the fault table. Raises `KeyError` for an
-        unknown name."""
+        unknown name.
+        """
         return self._by_name[key] if isinstance(key, str) else self._by_number.get(key, UNKNOWN)
 
     @property

@@ -1,5 +1,6 @@
 """The project's own kinds of faults, one record each, in the order in which `rack inject --list`
-shows them."""
+shows them.
+"""
 
 from __future__ import annotations
 

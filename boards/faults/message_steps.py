@@ -25,7 +25,8 @@ from rack.boards.faults.kind import kind_of
 
 class Outgoing(NamedTuple):
     """A message in transit: written in the cycle of tick `at`, made in that of `released`;
-    `damage`: bits to flip. `content`: of one that was delayed; None: that of the writer's own."""
+    `damage`: bits to flip. `content`: of one that was delayed; None: that of the writer's own.
+    """
 
     at: int
     released: int
@@ -40,7 +41,8 @@ Send = Callable[[Outgoing], None]
 
 class MessageStep:
     """One fault on one mailbox, at `index` in the layout; this base class changes nothing. `held`:
-    delayed messages."""
+    delayed messages.
+    """
 
     def __init__(self, entry: FaultEntry, writer: Writer, index: int) -> None:
         self.entry = entry
@@ -178,7 +180,8 @@ class FaultyWriter:
 
     def apply(self, faults: Sequence[FaultEntry]) -> None:
         """Apply these faults from now on; those that continue keep their delayed
-        messages."""
+        messages.
+        """
         steps = {}
         for entry in faults:
             kind = kind_of(entry).step

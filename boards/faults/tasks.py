@@ -70,7 +70,8 @@ def slow_plan(load: ExtraComputing, tick: int, now: int) -> int:
 
 class TaskFaults:
     """Applies a task's active faults: those of its writes by `apply`. `loads` are those of its
-    computing time."""
+    computing time.
+    """
 
     def __init__(
         self,
@@ -150,7 +151,8 @@ def take_core(segment: Segment, entry: FaultEntry) -> None:
 
 def act_on_core(segment: Segment, index: int) -> int:
     """Act the fault at `index` of the fault table, which takes a task's core, in a process forked
-    by the crate; return the exit status."""
+    by the crate; return the exit status.
+    """
     entry = FaultTable(segment).entries[index]
     step = kind_of(entry).step
     assert callable(step), "a fault of a core has a function"

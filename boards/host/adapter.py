@@ -1,5 +1,6 @@
 """What bus adapters have in common: they see the segment itself, and may open something outside the
-rack."""
+rack.
+"""
 
 from __future__ import annotations
 
@@ -35,13 +36,16 @@ class Adapter(Executor):
     @classmethod
     def replayed(cls, params: Mapping[str, Any], layout: Layout) -> Mapping[str, bool]:
         """Return the ports that a replay gives out as they were recorded, and whether it sends
-        their messages one by one; without any, the adapter runs as ever."""
+        their messages one by one; without any, the adapter runs as ever.
+        """
         return {}
 
     def attach(self, segment: Segment, entries: Entries | None) -> None:
         """Take the segment, before the self-test; in a replay with what was recorded in place of
-        what is out."""
+        what is out.
+        """
 
     def open(self) -> None:
         """Open the way outside. The board has its core and priority by now: threads that this
-        starts inherit both."""
+        starts inherit both.
+        """

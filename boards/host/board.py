@@ -1,5 +1,6 @@
 """A host board: one process under ordinary scheduling, which runs a program until that returns or
-the rack ends it."""
+the rack ends it.
+"""
 
 from __future__ import annotations
 
@@ -60,7 +61,8 @@ def run_host_board(segment: Segment, wiring: HostWiring, attention: int, output:
 
 def _opened(segment: Segment, wiring: HostWiring) -> HostBus:
     """Open the bus. What the process before this one has forked is being killed, and may hold the
-    board meanwhile."""
+    board meanwhile.
+    """
     deadline = time.monotonic() + RELEASED_S
     while True:
         try:

@@ -24,7 +24,8 @@ LONGEST_S = 1e9
 
 class BusReceiver:
     """An input of a program, see `HostReceiver`. Its first read returns the newest message
-    alone."""
+    alone.
+    """
 
     def __init__(self, reader: DoubleBufferReader) -> None:
         self._reader = reader
@@ -119,7 +120,8 @@ class HostBus:
 
     def wait(self, timeout_s: float) -> bool:
         """Wait until a message arrives; False when none has after the timeout, or when the run
-        ends."""
+        ends.
+        """
         if self._is_paced:
             ticks = round(min(timeout_s, LONGEST_S) / self._wiring.context.tick_s)
             self.block[Block.WAITS_UNTIL] = self.tick + max(1, ticks)
@@ -160,7 +162,8 @@ class HostBus:
 
     def address(self, name: str) -> int:
         """Return the bus address of a mailbox, or of the control block of a task. Raises
-        `LookupError`."""
+        `LookupError`.
+        """
         places = self._segment.map
         found = {**places.blocks, **places.mailboxes}
         if name not in found:
@@ -169,7 +172,8 @@ class HostBus:
 
     def words(self, address: int, count: int = 1) -> list[int]:
         """Return words of the crate's memory from a bus address on. Raises `ValueError` for an
-        address without one."""
+        address without one.
+        """
         size = self._segment.map.size
         last = address + WORD * count
         if address % WORD or not 0 <= address < last <= size:

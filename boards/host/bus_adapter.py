@@ -62,7 +62,8 @@ long."""
 
 class BusAdapter(Adapter):
     """Passes mailboxes between the two sides. Its status is done when the programs of all its host
-    boards are."""
+    boards are.
+    """
 
     params = AdapterParams
     wired_by = "params.pass"
@@ -111,7 +112,8 @@ class BusAdapter(Adapter):
 
     def attach(self, segment: Segment, entries: Entries | None) -> None:
         """Open the host side; in a replay, take over what the recorded run wrote, by port,
-        instead."""
+        instead.
+        """
         layout = segment.layout
         hosts = {host.name for host in layout.hosts}
         board = self.context.board
@@ -183,7 +185,8 @@ class BusAdapter(Adapter):
 
 class HostTurn(ReleasedTask):
     """A host board's program in lockstep, as its adapter sees it; its own end is
-    `rack.boards.host.bus.HostBus`."""
+    `rack.boards.host.bus.HostBus`.
+    """
 
     def __init__(self, segment: Segment, host: TaskSpec) -> None:
         super().__init__(segment, host)

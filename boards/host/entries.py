@@ -1,5 +1,6 @@
 """The entries of a bridge: what each passes, in which direction, when, and what is counted of
-it."""
+it.
+"""
 
 from __future__ import annotations
 
@@ -105,7 +106,8 @@ class AdapterParams(Table):
 @dataclass
 class EntryCount:
     """The counts of one entry: the fields of `AdapterEntry`. `written`: tick at which the newest
-    message was written."""
+    message was written.
+    """
 
     passed: int = 0
     refused: int = 0
@@ -136,7 +138,8 @@ class EntryCount:
 
 class Inward:
     """Into real time: from the ring of a host board to the bridge's own mailbox, which levels read
-    by ticks."""
+    by ticks.
+    """
 
     def __init__(self, segment: Segment, port: str, table: EntryConfig, count: EntryCount) -> None:
         self._ring = HostReader(segment, table.source)
@@ -151,7 +154,8 @@ class Inward:
         self, read: Mapping[str, Reading[AnyMessage]], write: Mapping[str, Any], tick: int
     ) -> None:
         """Take what waits, and check it. In lockstep what a program sends is there once its
-        computing is over."""
+        computing is over.
+        """
         ring = self._ring
         count = self._count
         out = write[self._port]
@@ -173,7 +177,8 @@ class Inward:
 
 class Outward:
     """Out of real time: from a level's mailbox, read by ticks, to one that host boards read; it
-    wakes them."""
+    wakes them.
+    """
 
     def __init__(
         self, segment: Segment, own: str, port: str, table: EntryConfig, count: EntryCount
@@ -209,7 +214,8 @@ class Outward:
 
 def last_written(segment: Segment, mailbox: str) -> tuple[AnyMessage | None, int]:
     """Return the newest message of a mailbox, with the tick at which it was written; None and
-    `NEVER` if there is none."""
+    `NEVER` if there is none.
+    """
     own = open_observer(segment, mailbox)
     reading = own.peek()
     return (reading.message, own.newest) if reading.is_there else (None, NEVER)

@@ -41,7 +41,8 @@ Rule = tuple[str, Sequence[str], Sequence[str]]
 
 def access_control(own: str, table: LanTable, is_operator: bool) -> dict[str, Any]:
     """Return zenoh's `access_control` for rack `own`, or for an operator of that name, who sets the
-    emergency stop of other racks."""
+    emergency stop of other racks.
+    """
     by_subject: dict[str, list[Rule]] = {}
     is_known = has_tls(table)
     if is_operator:

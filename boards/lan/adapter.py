@@ -46,7 +46,8 @@ _LAUNCH_MASK = (1 << 62) - 1
 
 class LanAdapter(Adapter):
     """Exchanges mailboxes with other racks. Its status shows every entry, a mailbox of its own each
-    rack."""
+    rack.
+    """
 
     params = LanTable
     wired_by = "params.export"
@@ -65,14 +66,16 @@ class LanAdapter(Adapter):
     @classmethod
     def names(cls, params: Mapping[str, Any]) -> Sequence[str]:
         """Return the other racks, and those who may set the emergency stop: alarms name them by
-        number."""
+        number.
+        """
         table = _table_in(params)
         return () if table is None else tuple(dict.fromkeys([*table.racks, *table.estop_from]))
 
     @classmethod
     def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, type[Message]]) -> MadePorts:
         """Return a port to read for each export, one to write for each import and rack, and the
-        status."""
+        status.
+        """
         table = _table_in(params)
         if table is None:
             return MadePorts(is_whole=False)
@@ -99,7 +102,8 @@ class LanAdapter(Adapter):
 
     def attach(self, segment: Segment, entries: Entries | None) -> None:
         """Take the segment: its grid, and the mailboxes to exchange, continued where they stand; in
-        a replay, take over what the recorded run wrote."""
+        a replay, take over what the recorded run wrote.
+        """
         words = segment.words
         board = self.context.board
         table = self._table
@@ -144,7 +148,8 @@ class LanAdapter(Adapter):
 
     def open(self) -> None:
         """Open the session, but for a replay: its threads inherit core and priority of the board.
-        Raises `LevelError`."""
+        Raises `LevelError`.
+        """
         if self._replayed is not None:
             return
         self._link = link = LanLink(self._rack, self._table)
@@ -199,7 +204,8 @@ class LanAdapter(Adapter):
 
     def _look(self, tick: int) -> None:
         """Note who has come, and who has gone; demand that the arm stop while a rack that had been
-        there is lost, if it is to stop then."""
+        there is lost, if it is to stop then.
+        """
         arrivals = self._peers.arrivals
         self.findings += self._peers.look(tick)
         must_stop = self._table.on_peer_loss == "stop" and bool(self._peers.lost)

@@ -1,5 +1,6 @@
 """The rack for which an adapter waits in lockstep, in one word of its control block: for whoever
-watches the rack."""
+watches the rack.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +41,8 @@ def word_of(place: int, why: Why) -> int:
 
 def awaited(segment: Segment) -> Iterator[tuple[str, str]]:
     """Yield the adapter that waits for another rack, if one does, with a text that says for which
-    and why."""
+    and why.
+    """
     for task in segment.layout.tasks:
         if word := segment.block(task.name)[Block.AWAITS]:
             # Only here: it takes a while to import.

@@ -54,7 +54,8 @@ _PONG_KIND = kind_of("pong", 1, np.dtype([("launch", "<u8"), ("stamps", "<i8", 4
 
 class RoundTrip(NamedTuple):
     """A ping and its answer, ns of CLOCK_MONOTONIC: sent and arrived here, received and answered
-    there."""
+    there.
+    """
 
     sent: int
     received: int
@@ -119,7 +120,8 @@ class ClockOffset:
 @dataclass
 class PeerClock:
     """The clock of one rack, and its grid: CLOCK_MONOTONIC of its tick 0, 0 before that; its
-    period; simulated time."""
+    period; simulated time.
+    """
 
     peer: PeerRack
     put: Any = None
@@ -268,7 +270,8 @@ class Clocks:
 
     def is_unanswered(self, peer: PeerRack, tick: int) -> bool:
         """Say whether the clock of a rack that is there has not been measured for long: its
-        messages are held back."""
+        messages are held back.
+        """
         is_unknown = peer.is_there and peer.offset_ns is None and not self._grid.is_lockstep
         return is_unknown and tick - peer.since > self._grid.ticks_in(UNKNOWN_NS)
 

@@ -1,5 +1,6 @@
 """`[adapter.lan]`: what a rack exchanges with others over a network, with whom, and by which
-rules."""
+rules.
+"""
 
 from __future__ import annotations
 
@@ -51,7 +52,8 @@ class ExportConfig(Table):
 
 class ImportConfig(Table):
     """`[adapter.lan.import.<port>]`: one mailbox of another rack, which levels here read as
-    `lan.<port>`."""
+    `lan.<port>`.
+    """
 
     source: Remote = Field(alias="from")
     """rack and mailbox, as in cell/task.orders"""
@@ -83,7 +85,8 @@ class ImportConfig(Table):
 
 class LanTable(Table):
     """The keys of `[adapter.lan]` that concern the network; those of its board are declared with
-    the boards'."""
+    the boards'.
+    """
 
     listen: tuple[str, ...] = Field(
         (), description=f"endpoints where other racks find this one, {ENDPOINT_NOTE}"

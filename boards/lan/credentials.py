@@ -111,7 +111,8 @@ class Credentials:
 
     def identity(self, chain: bytes) -> Identity | None:
         """Return whom certificates name that came with a seal; None: nobody whom the authority has
-        signed, or not any more. Raises `Credential`: the authority cannot be read."""
+        signed, or not any more. Raises `Credential`: the authority cannot be read.
+        """
         found = self._known.get(chain)
         if found is None:
             if (found := _identified(chain, self._authorities)) is None:
@@ -136,7 +137,8 @@ class Credentials:
 
     def flaws(self, addresses: Iterable[str] = ()) -> Iterator[Credential]:
         """Yield what is wrong with each file, now. `addresses` are those at which others reach this
-        rack."""
+        rack.
+        """
         found: dict[Path, list[Certificate]] = {self.authority: [], self.certificate: []}
         for path in found:
             try:
@@ -247,7 +249,8 @@ def _addresses(certificate: Certificate) -> list[str]:
 
 def _path(chain: list[Certificate], authorities: list[Certificate]) -> list[Certificate]:
     """Return the certificates from the first of a chain to an authority; empty: it does not lead
-    there, as where the certificate of a rack has signed another one."""
+    there, as where the certificate of a rack has signed another one.
+    """
     # As TLS does: of an authority that it says to be one, of a rack or person no more than that.
     any_kind = ExtensionPolicy.permit_all()
     authority = any_kind.require_present(BasicConstraints, Criticality.AGNOSTIC, None)

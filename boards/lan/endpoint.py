@@ -23,7 +23,8 @@ PERMITTED = (
 
 class Endpoint(NamedTuple):
     """An endpoint; `host` is a name, or an address without brackets; of a Unix socket, its own
-    name."""
+    name.
+    """
 
     protocol: str
     host: str

@@ -52,7 +52,8 @@ class MessageOrder:
 
     def admits(self, head: Envelope) -> bool:
         """Return True if a message is newer than all before it. Count what is missing before it, or
-        else why it is not newer."""
+        else why it is not newer.
+        """
         count = self.count
         if head.launch != self.launch:
             # Resumed in lockstep, where launches are not on record, it is the same one. What
@@ -108,7 +109,8 @@ class Export:
 
     def recall(self, tick: int, ticks: int) -> None:
         """Send what an adapter before this one sent at `tick`, if it did; `ticks` are those of its
-        cycle."""
+        cycle.
+        """
         if (tick // ticks) % self.every:
             return
         self._source.read(tick - self.every * ticks)
@@ -240,7 +242,8 @@ class Import:
 
     def _opened(self, arrived: Arrived) -> Envelope | None:
         """Return the head of what came, if it may be a message of this mailbox; else count that it
-        was refused."""
+        was refused.
+        """
         head = self._sealer.opened(*arrived)
         if (
             not isinstance(head, Flaw)

@@ -97,7 +97,8 @@ class Sealer:
 
     def opened(self, key: str, envelope: bytes | None, payload: bytes) -> Envelope | Flaw:
         """Return the head of what has come under a key expression, or what is wrong with it, which
-        is counted."""
+        is counted.
+        """
         if len(payload) > self._most:
             return self._flawed(Flaw.OVERSIZED)
         if (

@@ -1,5 +1,6 @@
 """The grid of this rack next to those of others: ticks as times on another machine's clock, and the
-other way round."""
+other way round.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +41,8 @@ class OwnGrid:
 
     def stamp_ns(self, tick: int) -> int:
         """Return the CLOCK_MONOTONIC of a tick on this machine, ns; in lockstep its simulated
-        time."""
+        time.
+        """
         return self.time_ns(tick) if self.is_lockstep else self._clock.time_of(tick)
 
     def tick_of(self, head: Envelope, peer: PeerRack, tick: int) -> int:

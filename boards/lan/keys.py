@@ -33,7 +33,8 @@ def out_key(rack: str, mailbox: str) -> str:
 
 def alive_key(rack: str, launch: int, cycle_ns: int = 0) -> str:
     """Return the key expression of a launch's token; in lockstep with the length of its adapter's
-    cycle, ns."""
+    cycle, ns.
+    """
     return f"rack/{rack}/alive/{launch:016x}" + (f"-{cycle_ns}" if cycle_ns else "")
 
 
@@ -76,5 +77,6 @@ def estop_key(sender: str, to: str) -> str:
 
 def estop_answer_key(rack: str, to: str) -> str:
     """Return the key under which rack `rack` seals its answer, so that no request passes for an
-    answer."""
+    answer.
+    """
     return f"rack/{rack}/estop-answer/{to}"

@@ -118,7 +118,8 @@ class LanLink:
         self, declare: Callable[..., Any], key: str, unread: int, **options: bool
     ) -> Callable[[], Iterator[Any]]:
         """Declare something whose messages wait in a channel; return a function that yields those
-        that have come since its last call, oldest first."""
+        that have come since its last call, oldest first.
+        """
         channel = declare(key, zenoh.handlers.RingChannel(unread), **options)
         self._kept.append(channel)
 
@@ -133,13 +134,15 @@ class LanLink:
 
     def subscribe(self, key: str) -> Callable[[], Iterator[Arrived]]:
         """Return a function that yields what has come under a key expression since the last call,
-        oldest first."""
+        oldest first.
+        """
         waiting = self._channel(self.session.declare_subscriber, key, UNREAD)
         return lambda: map(Arrived.of, waiting())
 
     def on(self, key: str, callback: Callable[[Arrived], None]) -> None:
         """Call a function in a thread of the network with everything that comes under a key
-        expression, at once."""
+        expression, at once.
+        """
 
         def take(sample: zenoh.Sample) -> None:
             callback(Arrived.of(sample))
@@ -168,14 +171,16 @@ class LanLink:
 
     def declare_alive(self, launch: int, cycle_ns: int = 0) -> None:
         """Show others that this launch is there; after everything that they may send it. See
-        `alive_key`."""
+        `alive_key`.
+        """
         self._kept.append(
             self.session.liveliness().declare_token(alive_key(self.rack, launch, cycle_ns))
         )
 
     def watch_alive(self) -> Callable[[], Iterator[tuple[str, int, bool]]]:
         """Return a function that yields rack, launch, and whether it has come or gone, of others,
-        oldest first."""
+        oldest first.
+        """
         declare = self.session.liveliness().declare_subscriber
         waiting = self._channel(declare, ALL_ALIVE, TOKENS, history=True)
 
@@ -265,7 +270,8 @@ def _settings(
 
 def _locator(text: str) -> str:
     """Return an endpoint as zenoh knows it. Raises `LevelError`: others may enter the folder of
-    this user's sockets."""
+    this user's sockets.
+    """
     endpoint = Endpoint.of(text)
     if not endpoint.is_private:
         return text

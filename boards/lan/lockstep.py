@@ -54,7 +54,8 @@ class StepFlag(IntFlag):
 
 class Step(NamedTuple):
     """One step of a rack. `cycle_ns`: length of its adapter's cycle; `racks`: those for which it
-    waits."""
+    waits.
+    """
 
     head: Envelope
     cycle_ns: int
@@ -194,12 +195,14 @@ class Barrier:
 
     def publish(self, key: str) -> Callable[[bytes, bytes], None]:
         """Return a function that sends payload and envelope under a key expression, in the step of
-        this cycle."""
+        this cycle.
+        """
         return lambda payload, envelope: self._exports.append(Arrived(key, envelope, payload))
 
     def subscribe(self, key: str) -> Callable[[], Iterator[Arrived]]:
         """Return a function that yields what others have sent under a key expression up to this
-        cycle, once."""
+        cycle, once.
+        """
         waiting = self._imports.setdefault(key, deque())
         return lambda: (waiting.popleft() for _ in range(len(waiting)))
 
@@ -251,7 +254,8 @@ class Barrier:
 
     def close(self) -> None:
         """Let the others go on without this rack, if its run has ended: a board alone may come
-        back."""
+        back.
+        """
         if self._steps and (self._is_over or self._has_refused):
             self._send(*self._steps[-1], StepFlag.OVER | self._first)
 
@@ -330,7 +334,8 @@ class Barrier:
 
     def _is_of(self, partner: Partner, launch: int) -> bool:
         """Say whether a launch is the one that steps with this rack; one that comes later takes no
-        part."""
+        part.
+        """
         if partner.launch != launch:
             if self._has_begun and partner.launch != NONE:
                 partner.is_out = True

@@ -125,7 +125,8 @@ class PeerRack:
 
     def joins(self, launch: int, tick: int) -> None:
         """Note, in lockstep, that it is there: from the start, or still when this adapter has been
-        restarted."""
+        restarted.
+        """
         if self.presence is Presence.AWAITED:
             self.presence = Presence.THERE
             self.launches = 1
@@ -135,7 +136,8 @@ class PeerRack:
 
     def resume(self, message: PeerPresence | AnyMessage, confirm_by: int) -> None:
         """Continue from the message that an adapter before this one wrote: see
-        `rack.levels.peer.PeerPresence`."""
+        `rack.levels.peer.PeerPresence`.
+        """
         self.presence = Presence(message.presence)
         self.launch = message.launch
         self.launches = message.launches
@@ -168,7 +170,8 @@ class Peers:
 
     def watch(self, changes: Changes, is_lockstep: bool = False) -> None:
         """Take what comes and goes from now on from this function: rack, launch, whether it has
-        come."""
+        come.
+        """
         self._changes = changes
         self._is_lockstep = is_lockstep
 

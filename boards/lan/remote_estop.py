@@ -79,6 +79,7 @@ class Desk:
 
     def fill(self, record: object) -> None:
         """Write its counts into the group of a status; in lockstep none, since they do not depend
-        on ticks alone."""
+        on ticks alone.
+        """
         if not self._grid.is_lockstep:
             fill_counts(record, self.count.record.item())

@@ -21,7 +21,8 @@ from rack.levels.peer import PeerPresence, Presence, peer_port
 
 class ReplayedNetwork:
     """What came of the `peers` and `imports` of an adapter, by the recorded messages of its
-    ports."""
+    ports.
+    """
 
     def __init__(
         self,

@@ -1,5 +1,6 @@
 """The status of the network adapter: what it counts of each export and import, and of everything
-else that came over the network."""
+else that came over the network.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
 """The attributes of a level as plain data, for people: its own, and of the objects in them what has
-changed since the level was built. Programs, configs and views of shared memory are left out."""
+changed since the level was built. Programs, configs and views of shared memory are left out.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +40,8 @@ class AttributeView:
 
     def show(self) -> Mapping[str, Any]:
         """Return its attributes by name, as JSON holds them: numbers, texts, lists, and objects as
-        dictionaries of theirs."""
+        dictionaries of theirs.
+        """
         now = _Reading().attributes(self._level, DEPTH)
         return _present(
             (name, _changed(value, self._built.get(name)))

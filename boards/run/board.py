@@ -62,7 +62,8 @@ def enter(crate: int, name: str, segment: Segment, board: Callable[[Segment], in
 
 def _describe_failure(segment: Segment, name: str, error: Exception) -> str:
     """Return the traceback of an error; where it ended the board's last process in the same place,
-    only how often it has come again."""
+    only how often it has come again.
+    """
     if name in segment.map.blocks:
         block = segment.block(name)
         place = crc32("".join(traceback.format_tb(error.__traceback__)).encode())

@@ -185,7 +185,8 @@ def basis_of(port: Any, tick: int) -> int:
 @compiled
 def publish(port: Any, tick: int, stamp: int) -> int:
     """Publish the message of a port's record; return the process of an intruder, 0: none. See
-    `Slots.publish`."""
+    `Slots.publish`.
+    """
     record = slot_at(port.record)
     before = record.serial
     slot = slot_of(port, before + 1)

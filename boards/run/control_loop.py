@@ -91,7 +91,8 @@ class VirtualControlLoop(Task):
 
     def _handle_delay(self, tick: int) -> None:
         """Note a pause in reading, in the first cycle too; in one that begins late, check the
-        clock."""
+        clock.
+        """
         if self.next_cycle.skipped or not self._has_cycled:
             self.inputs.task.since = tick
             self._has_cycled = True
@@ -100,7 +101,8 @@ class VirtualControlLoop(Task):
 
     def process(self, tick: int) -> None:
         """Let the level process, given the demand on the arm; then report its findings and the
-        faults that acted."""
+        faults that acted.
+        """
         executor = self.executor
         executor.demand = _DEMANDS[self.words[System.DEMAND]]
         executor.process(tick)
@@ -184,7 +186,8 @@ class PlannerLoop(Task):
 
     def _pass(self, tick: int) -> None:
         """Let a release pass without a plan; trace it if it came too late or others were
-        skipped."""
+        skipped.
+        """
         self.outputs.flush(tick, self.clock.now())
         in_time = self.clock.now() < tick + self.slice
         if in_time and not self.next_cycle.skipped:

@@ -145,7 +145,8 @@ class Copier:
         show: Callable[[], Mapping[str, Any]],
     ) -> tuple[GoOn, int]:
         """Wait until a rack goes on from here; return the request, and the process that waits from
-        then on. End with the crate."""
+        then on. End with the crate.
+        """
         while True:
             for fd, offset in offsets.items():
                 # Open the file for this process alone, and read it up to `offset`.
@@ -168,7 +169,8 @@ class Copier:
 
     def _refused(self, memory: Collection[int]) -> list[str]:
         """Return what the process has that no copy can have; `memory`: files that are the
-        clock's."""
+        clock's.
+        """
         segment = os.fstat(self._segment.fd)
         found = [
             f"it holds {name}"

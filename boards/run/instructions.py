@@ -23,7 +23,8 @@ _R = TypeVar("_R")
 
 class linked(compiled[_P, _R]):  # noqa: N801  # a decorator
     """Mark a function that returns what compiled code calls under its name: an instruction, or a
-    function of a C library. `key`: what else it depends on than this file."""
+    function of a C library. `key`: what else it depends on than this file.
+    """
 
     def __init__(self, make: Callable[_P, _R], key: str = "") -> None:
         super().__init__(make)
@@ -126,7 +127,8 @@ def record_at(dtype: np.dtype) -> linked[..., Any]:
 @linked
 def xxh3(*_: int) -> Any:
     """Return the checksum of the bytes at an address, so many, with a seed: by the C function that
-    the Python classes call."""
+    the Python classes call.
+    """
     from llvmlite import binding
     from numba import types
 

@@ -40,7 +40,8 @@ WORD = 8
 
 class Line(NamedTuple):
     """One mailbox to read: where its reading goes, the function that reads it as of a tick, and the
-    reader behind that."""
+    reader behind that.
+    """
 
     values: dict[str, Reading[AnyMessage]]
     key: str
@@ -157,7 +158,8 @@ class WriteTable:
 
     def write(self, tick: int) -> bool:
         """Write the messages that are due, in a cycle whose end has not come; say whether a writer
-        has an intruder."""
+        has an intruder.
+        """
         is_intruded: bool = self._write_ports(self._address, self._count, tick, monotonic_ns())
         if is_intruded:
             for writer, port in zip(self._writers, self._ports, strict=True):

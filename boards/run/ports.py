@@ -86,7 +86,8 @@ class InputPorts:
 
     def follow(self, segment: Segment, queue: QueueWriter, alarms: AlarmWriter) -> None:
         """Read the position of the reader of a queue that the task writes, with the mailboxes of
-        its ports."""
+        its ports.
+        """
         found = watched(segment, taken_name(queue.spec.name), alarms, self.task)
 
         def read_and_note(tick: int) -> Reading[AnyMessage]:
@@ -177,7 +178,8 @@ class OutputPort:
 
     def apply(self, faults: Sequence[FaultEntry]) -> None:
         """Apply those of these faults that concern the mailbox; messages delayed by earlier ones go
-        out with the next write."""
+        out with the next write.
+        """
         chosen = [
             entry
             for entry in faults

@@ -87,7 +87,8 @@ class ClockCopies:
 
     def __call__(self, tick: int) -> int:
         """Take a snapshot before `tick`, if one is due and every process is there; return the next
-        tick before which one is."""
+        tick before which one is.
+        """
         words = self._segment.words
         wanted = words[System.SNAPSHOT_AT] - 1
         part, every = words[System.SNAPSHOT_PART], words[System.SNAPSHOT_EVERY]

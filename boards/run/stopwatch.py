@@ -85,7 +85,8 @@ class Stopwatch:
 
     def now(self, deadline: int) -> int | None:
         """Return the clock's tick once the level has processed; None while tick `deadline` has not
-        come."""
+        come.
+        """
         if self._lockstep_done is None and self.process_ns < self._time_of(deadline):
             return None
         now = self._clock.now()
@@ -169,7 +170,8 @@ class Stopwatch:
 
     def count_bus(self) -> None:
         """Update the bus counters of the control block; doing so in every cycle would cost too
-        much."""
+        much.
+        """
         before = self._traffic
         self._traffic = self._inputs.traffic + self._outputs.traffic
         words = (Block.READS, Block.READ_BYTES, Block.WRITES, Block.WRITE_BYTES)

@@ -44,7 +44,8 @@ heard."""
 
 class SystemController:
     """The clock's duties at every tick besides releasing tasks; see
-    `rack.backplane.clock.driver.Controller`."""
+    `rack.backplane.clock.driver.Controller`.
+    """
 
     def __init__(
         self, segment: Segment, wiring: ClockWiring, driver: ClockDriver, end_of_run: EndOfRun
@@ -81,14 +82,16 @@ class SystemController:
 
     def rests_until(self, tick: int) -> int:
         """Return the first tick after `tick` that needs `begin`, or may end the run, as far as is
-        known."""
+        known.
+        """
         if self._settled is None:
             return tick + 1
         return min(self._faults.next_tick, self._desk.next_tick, self._end_of_run.next_tick)
 
     def _handle_losses(self, tick: int) -> None:
         """Let restarted boards rejoin, latch for those given up, and set the demand for all other
-        losses."""
+        losses.
+        """
         words = self._words
         seen = words[System.LOSSES], self._driver.watchdog.losses
         processes = self._driver.processes
@@ -231,7 +234,8 @@ class OperatorDesk:
 
     def _is_over(self, entry: RequestEntry) -> bool:
         """Return whether the level has refused the command, or accepted a newer one in its
-        place."""
+        place.
+        """
         mailbox = entry.mailbox
         serial = entry.serial
         newest = self._newest.get(mailbox, 0)
@@ -280,7 +284,8 @@ class EndOfRun:
 
     def __call__(self, tick: int) -> int | None:
         """Return the tick at which the run stops, by the messages as of the tick before; None until
-        it is known."""
+        it is known.
+        """
         final = tick - 1
         if final >= self._next and self._task_ends is None and self._reader is not None:
             boundary = final - (final - self._phase) % self._every

@@ -1,5 +1,6 @@
 """A task on its board: the common part of the executor's and the planner's loop, the clock guard of
-fast tasks, and the board's interrupt handler."""
+fast tasks, and the board's interrupt handler.
+"""
 
 from __future__ import annotations
 
@@ -186,7 +187,8 @@ class InterruptHandler:
 
 def in_turn(*accesses: Callable[[int], None] | None) -> Callable[[int], None]:
     """Return a function that makes these accesses one after the other, as far as there are any; one
-    alone itself."""
+    alone itself.
+    """
     found = [access for access in accesses if access is not None]
 
     def make_all(tick: int) -> None:

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 
 def spanned(names: Sequence[str]) -> str:
     """Return names as text; of three or more that are numbered in order the first and the last,
-    "joint1 ... joint6"."""
+    "joint1 ... joint6".
+    """
     rows: list[list[str]] = []
     for name in names:
         if rows and name == _following(rows[-1][-1]):

@@ -1,5 +1,6 @@
 """The path of an operator's command, from the commanded level to the lowest, and its longest
-response."""
+response.
+"""
 
 from __future__ import annotations
 
@@ -51,19 +52,22 @@ class CommandPath:
     @property
     def bound_eq_3_2(self) -> int:
         """Number of levels times the longest cycle (eq. 3.2), from the release that reads the
-        command."""
+        command.
+        """
         return len(self.cycles) * max(self.cycles)
 
     @property
     def sum_eq_3_3(self) -> int:
         """The sum of the cycles (eq. 3.3), from the release that reads the command, if each divides
-        the one above."""
+        the one above.
+        """
         return sum(self.cycles)
 
     @property
     def longest(self) -> int:
         """The longest response on the grid: given just too late for a release, waiting for every
-        level's next one."""
+        level's next one.
+        """
         waits = [
             grid_wait(written, read)
             for written, read in zip(self.releases, self.reads[1:], strict=False)
@@ -73,7 +77,8 @@ class CommandPath:
 
 def command_paths(rack: RackTiming, layout: Layout) -> dict[str, CommandPath]:
     """Return the longest path from every level that an operator can command to the lowest, by
-    level."""
+    level.
+    """
     boxes = {box.name: box for box in layout.mailboxes}
     found: dict[str, CommandPath] = {}
     for chain in rack.chains:

@@ -44,7 +44,8 @@ class FramePlace:
 @dataclass(frozen=True)
 class CoreFrames:
     """Frames of one core, by number in the major frame, in which the same boards have the same
-    places."""
+    places.
+    """
 
     core: int
     frames: tuple[int, ...]

@@ -52,7 +52,8 @@ class BoardTiming:
     @property
     def is_plan_budgeted(self) -> bool:
         """Whether the budget covers its planner: in a measured run the planner may have made no
-        plan."""
+        plan.
+        """
         return self.has_planner and self.budget is not None and self.budget.plan_ns > 0
 
     @property
@@ -96,13 +97,15 @@ class LevelTiming:
     @property
     def executor_planner_ns(self) -> int:
         """t_executor-planner of eqs 3.9 and 3.10: the plan read and updated, C and U, both in the
-        worst cycle."""
+        worst cycle.
+        """
         return self.exchange_ns + self.update_ns
 
     @property
     def residual_ns(self) -> int:
         """t_residual of eq. 3.5, and alpha of eq. 3.6: the budget's times are the longest of all
-        cycles."""
+        cycles.
+        """
         return self.cycle_ns - self.execution_ns - self.communication_ns
 
     @property

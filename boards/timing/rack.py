@@ -59,7 +59,8 @@ class RackTiming:
     @cached_property
     def chains(self) -> tuple[tuple[str, ...], ...]:
         """Every chain of boards from a highest to a lowest; a rack with a board per joint has one
-        for every joint."""
+        for every joint.
+        """
         lowest = [board.name for board in self.boards.values() if board.above and not board.below]
         return tuple(chain for name in lowest for chain in self._chains((name,)))
 
@@ -74,7 +75,8 @@ class RackTiming:
     @cached_property
     def parallel(self) -> tuple[ParallelChains, ...]:
         """All chains: those of equal cycles together where they are every combination of their
-        boards."""
+        boards.
+        """
         by_cycles: dict[tuple[int, ...], list[tuple[str, ...]]] = {}
         for chain in self.chains:
             by_cycles.setdefault(tuple(self.boards[name].every for name in chain), []).append(chain)
@@ -114,7 +116,8 @@ class RackTiming:
     @cached_property
     def ranks(self) -> tuple[tuple[str, ...], ...]:
         """The boards of all chains by level, the highest first: each as far down as its longest
-        chain from above."""
+        chain from above.
+        """
         depth: dict[str, int] = {}
         for chain in self.chains:
             for at, name in enumerate(chain):
@@ -167,7 +170,8 @@ class RackTiming:
 
     def interrupted_ns(self, task: str) -> int:
         """Return the processor time that interrupts take from a task in a cycle, or in a plan; 0 if
-        it serves none."""
+        it serves none.
+        """
         inbox = self.inboxes.get(task)
         return 0 if inbox is None else inbox.cost_ns(self.slice_ticks(task) * self.clock_ns)
 
@@ -233,7 +237,8 @@ class RackTiming:
     @cached_property
     def cores(self) -> dict[str, int]:
         """The cores that the config asks for, by task, the clock's first; this machine may lack
-        some."""
+        some.
+        """
         found = {self.clock.name: self.clock.core}
         for board in self.boards.values():
             found[board.name] = board.core
@@ -262,6 +267,7 @@ def _nonzero(*parts: Part) -> tuple[Part, ...]:
 
 def grid_wait(written: TickGrid, read: TickGrid) -> int:
     """Return the longest time, ticks, from a message on the grid of its writer to the next read
-    (eq. 3.7)."""
+    (eq. 3.7).
+    """
     common = gcd(written.every, read.every)
     return read.every - common + (read.phase - written.phase) % common

@@ -218,7 +218,8 @@ def blocking_ns(task: TimedTask, tasks: Iterable[TimedTask]) -> int:
 
 def load_of(tasks: Iterable[TimedTask], context_switch_ns: int) -> dict[int, float]:
     """Return the load of each core, by core, context switches included; above 1 it is
-    overloaded."""
+    overloaded.
+    """
     loads: dict[int, float] = {}
     for task in tasks:
         if task.cost_ns:

@@ -19,7 +19,8 @@ Variants = Mapping[str, Sequence[Sequence[Part]]]
 @dataclass(frozen=True)
 class Span:
     """An uninterrupted stretch in which a task computed one unit function, ns; `release_ns` is its
-    job's."""
+    job's.
+    """
 
     task: str
     core: int
@@ -122,7 +123,8 @@ def _run(runners: list[_Runner], until_ns: int) -> None:
 
 class _Runner:
     """One task, job by job. `ready_at` is the time at which its job, or the next one, can begin,
-    ns."""
+    ns.
+    """
 
     def __init__(
         self, task: TimedTask, context_switch_ns: int, variants: Sequence[Sequence[Part]]

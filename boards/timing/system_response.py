@@ -1,5 +1,6 @@
 """The response of the whole system, predicted: its bounds (eqs 3.2, 3.3), and the mailboxes along
-which information passes."""
+which information passes.
+"""
 
 from __future__ import annotations
 

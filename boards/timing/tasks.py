@@ -1,5 +1,6 @@
 """Budgets of levels, and tasks of the timing model: unit functions of known length, released on a
-grid."""
+grid.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +41,8 @@ class Unit(StrEnum):
 @dataclass(frozen=True)
 class Part:
     """A stretch of one unit function; None: a context switch. A part that is not preemptible runs
-    at its task's `ceiling`."""
+    at its task's `ceiling`.
+    """
 
     unit: Unit | None
     time_ns: int

@@ -68,13 +68,15 @@ def communication_ns(rows: Rows) -> Values:
 
 def residual_ns(rows: Rows, slice_ns: int) -> Values:
     """Return t_residual: the part of a time slice left when the cycle ended; negative after a
-    miss."""
+    miss.
+    """
     return np.asarray(rows["release_ns"] + slice_ns - rows["end_ns"])
 
 
 def gaps_ns(rows: Rows, stretches: Values | None = None) -> Values:
     """Return the time from each start to the next one, shape (n - 1,); less with the number of the
-    recording's stretch for each row: what was between two stretches is unknown."""
+    recording's stretch for each row: what was between two stretches is unknown.
+    """
     gaps = np.diff(rows["start_ns"])
     return gaps if stretches is None else gaps[np.diff(stretches) == 0]
 
@@ -96,7 +98,8 @@ def counts(rows: Rows) -> tuple[int, int]:
 
 def plans(rows: Rows) -> Values:
     """Return the records of a planner that made a plan: a release that passed without one may leave
-    a record too."""
+    a record too.
+    """
     return rows[(rows["flags"] & Flag.PLANNED) > 0]
 
 
@@ -122,7 +125,8 @@ def plan_ages(executor: Values, made: Values, visible_at: Values) -> Values:
 
 def distribution(values: Values) -> Distribution | None:
     """Return min, p50, p99, p99.9 and max of values of any unit, shape (n,); None when there are
-    none."""
+    none.
+    """
     if not len(values):
         return None
     found = {"min": float(values.min())}
@@ -132,7 +136,8 @@ def distribution(values: Values) -> Distribution | None:
 
 class Occupation:
     """When a core was occupied: a union of intervals. `starts` and `ends` are those of the union,
-    ns, shape (n,)."""
+    ns, shape (n,).
+    """
 
     def __init__(self, starts: Values, ends: Values) -> None:
         """Take intervals from `starts` to `ends`, each of shape (n,), in any order."""
@@ -181,7 +186,8 @@ def waking_ns(rows: Rows) -> Values:
 
 def overhead_ns(rows: Rows) -> int:
     """Return the median processor time of waking up for a cycle and closing it; 0 where every cycle
-    was disturbed."""
+    was disturbed.
+    """
     beyond = _beyond_stamps(rows)
     undisturbed = beyond[beyond >= 0]
     return int(np.median(undisturbed)) if len(undisturbed) else 0
@@ -189,7 +195,8 @@ def overhead_ns(rows: Rows) -> int:
 
 def _beyond_stamps(rows: Rows) -> Values:
     """Return processor time less the time from start to end: negative where others had the core
-    meanwhile."""
+    meanwhile.
+    """
     return np.asarray(rows["processor_ns"] - lasted_ns(rows))
 
 
@@ -230,7 +237,8 @@ def _undisturbed(parts: Values, processor_ns: Values) -> Values:
 
 def _shared_out(total: Values, weights: Values) -> Values:
     """Return `total`, shape (n,), distributed by `weights`, shape (n, 4), none more than its
-    weight."""
+    weight.
+    """
     sums = weights.sum(axis=1)
     factor = np.divide(np.minimum(total, sums), sums, out=np.zeros(len(sums)), where=sums > 0)
     return np.asarray(weights * factor[:, None])

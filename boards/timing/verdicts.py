@@ -106,7 +106,8 @@ def level_verdicts(rack: RackTiming, level: LevelTiming) -> Iterator[EquationVer
 
 def system_verdicts(rack: RackTiming) -> Iterator[EquationVerdict]:
     """Yield the verdicts on the system's response, chain by chain; with a goal for it, also on
-    every cycle in them."""
+    every cycle in them.
+    """
     goal_ns = None if rack.response_goal_ns is None else rack.response_goal_ns / rack.speed
     for found in rack.parallel:
         yield from _of_chains(rack, found, goal_ns)
@@ -119,7 +120,8 @@ def system_verdicts(rack: RackTiming) -> Iterator[EquationVerdict]:
 
 def response_subject(rack: RackTiming, chains: ParallelChains) -> str:
     """Return the subject of the system's response along these chains; where there are others, it
-    names them."""
+    names them.
+    """
     return SYSTEM if len(rack.parallel) == 1 else f"{SYSTEM}, {chains.text}"
 
 
@@ -216,7 +218,8 @@ def _of_cores(rack: RackTiming) -> Iterator[EquationVerdict]:
 
 def _of_frames(rack: RackTiming) -> Iterator[EquationVerdict]:
     """Yield the verdicts on the places of a static schedule: one for all frames in which a place is
-    the same."""
+    the same.
+    """
     for alike in core_frames(rack):
         for place in alike.places:
             limit = f"'{place.until}' begins" if place.until else "the frame ends"

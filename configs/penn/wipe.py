@@ -28,7 +28,8 @@ def expect(request, end, what):
 
 def wipe(y, seconds, end, what):
     """Press while moving along the surface to y; raise an error if the force was wrong on more than
-    a fifth of the way."""
+    a fifth of the way.
+    """
     pressed = {}
 
     def look():

@@ -1,5 +1,6 @@
 """The arm: its interface to the servo level, the simulated one, and the faults injected between the
-two."""
+two.
+"""
 
 from rack.levels import compiled
 from rack.levels.arm import drives, sensors, substeps

@@ -65,7 +65,8 @@ class Arm(BrakedArm):
 
     def look(self, scene: Scene) -> None:
         """Fill a `SCENE` with the poses of bodies and tool. Default: bodies at their start, the
-        tool as sensed."""
+        tool as sensed.
+        """
         offset = self.cell.encoders.offset
         position = self.sense().position
         self._data.qpos[self.cell.qpos] = position if offset is None else position + offset

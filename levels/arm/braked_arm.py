@@ -28,7 +28,8 @@ class BrakedArm(Plant, DrivableArm):
         self, cell: Cell, scene: SceneConfig, clock_ns: int, every: int = 1, seed: int = 0
     ) -> None:
         """Start braked at home. One tick is `clock_ns`, one torque cycle `every` ticks; `seed` is
-        for random noise."""
+        for random noise.
+        """
         super().__init__(cell)
         self.every = every  # ticks of a cycle
         # Ticks without a command after which the brakes must engage.
@@ -49,18 +50,21 @@ class BrakedArm(Plant, DrivableArm):
 
     def drive(self, torque: Array, grip_force: float) -> Finding | None:
         """Release the brakes and apply torques, N m, and grip force, N; see `Link.drive`. Sets
-        `waited` to 0. Default: refused, see `takes`."""
+        `waited` to 0. Default: refused, see `takes`.
+        """
         raise NotImplementedError
 
     def follow(self, target: JointTarget, grip_force: float) -> Finding | None:
         """Release the brakes and follow; see `Link.follow`. Sets `waited` to 0, and `torque` to
-        what is predicted or reported. Default: refused, see `takes`."""
+        what is predicted or reported. Default: refused, see `takes`.
+        """
         raise NotImplementedError
 
     @classmethod
     def takes(cls, interface: Interface) -> bool:
         """Say whether the drives have an interface: `rack check` refuses a config that names
-        another. Default: by the methods that the class has."""
+        another. Default: by the methods that the class has.
+        """
         if interface == "torque":
             return cls.drive is not BrakedArm.drive
         return cls.follow is not BrakedArm.follow
@@ -80,11 +84,13 @@ class BrakedArm(Plant, DrivableArm):
 
     def reset(self) -> None:
         """Ask drives in FAULT to leave it, for DISABLED, and clear `fault`, which says why they
-        were in it. Default: they cannot."""
+        were in it. Default: they cannot.
+        """
 
     def refused(self, torque: Array) -> Finding | None:
         """Return why `torque`, (joints,), N m, must not be applied: NaN, infinite, beyond a limit;
-        None: it may. The caller then brakes; the refusal is counted and reported here."""
+        None: it may. The caller then brakes; the refusal is counted and reported here.
+        """
         if np.count_nonzero(np.abs(torque) <= self._permitted) == torque.size:
             return None
         if np.isfinite(torque).all():
@@ -149,5 +155,6 @@ class BrakedArm(Plant, DrivableArm):
 
     def feel(self) -> Array | None:
         """Return the newest sample of the wrist sensor, (6,), N, N m, in its frame. Default: None,
-        it has none."""
+        it has none.
+        """
         return None

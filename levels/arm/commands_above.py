@@ -1,5 +1,6 @@
 """The commands of the boards above that drive an arm, or a hand, together: all of them must be
-fresh."""
+fresh.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +34,8 @@ class CommandsAbove:
         self, commands: Mapping[str, Reading[SampledCommand]], tick: int, since: int
     ) -> str:
         """Return why commands are missing at `tick`; empty: all are fresh, and rest on a status of
-        `since` or later."""
+        `since` or later.
+        """
         all_know = True
         for board, oldest in self.oldest.items():
             value, verdict, is_lost, _ = commands[board]

@@ -56,7 +56,8 @@ def copied(sample: Sensed) -> Sensed:
 
 class Link(Protocol):
     """The path between the servo level and an arm: samples come up, torques or set points go
-    down."""
+    down.
+    """
 
     def sense(self) -> Sensed:
         """Return the newest sample. The arrays are valid until the next call."""
@@ -71,7 +72,8 @@ class Link(Protocol):
 
     def follow(self, target: JointTarget, grip_force: float) -> Finding | None:
         """Release the brakes, and let the drives be at `target` in one cycle; then they go on at
-        that velocity. Otherwise as `drive`."""
+        that velocity. Otherwise as `drive`.
+        """
 
 
 class FaultyPath(Link, Protocol):
@@ -126,7 +128,8 @@ class DrivableArm(ABC):
         self, cell: Cell, scene: SceneConfig, clock_ns: int, every: int = 1, seed: int = 0
     ) -> None:
         """Start braked at home. One tick is `clock_ns`, one torque cycle `every` ticks; `seed` is
-        for random noise."""
+        for random noise.
+        """
 
     @abstractmethod
     def connect(
@@ -157,12 +160,14 @@ class DrivableArm(ABC):
     @abstractmethod
     def takes(cls, interface: Interface) -> bool:
         """Return whether the drives have an interface: `rack check` refuses a config that names
-        another."""
+        another.
+        """
 
     @abstractmethod
     def brake(self) -> None:
         """Engage the brakes: they stop and hold the joints, motors give no torque, the gripper
-        keeps its force."""
+        keeps its force.
+        """
 
     @abstractmethod
     def step(self, ticks: int) -> None:
@@ -190,7 +195,8 @@ class DrivableArm(ABC):
     @abstractmethod
     def reset(self) -> None:
         """Ask drives in FAULT to leave it, for DISABLED, and clear `fault`, which says why they
-        were in it."""
+        were in it.
+        """
 
     @abstractmethod
     def named(self, contact: tuple[int, int]) -> str:
@@ -199,7 +205,8 @@ class DrivableArm(ABC):
     @abstractmethod
     def feel(self) -> Array | None:
         """Return the newest sample of the wrist sensor, (6,), N, N m, in its frame. None: it has
-        none."""
+        none.
+        """
 
     @abstractmethod
     def look(self, scene: Scene) -> None:
@@ -212,10 +219,12 @@ class DrivableArm(ABC):
     @abstractmethod
     def restore(self, state: ArmState) -> None:
         """Continue from an `ARM_STATE`: called once, before the first `step`, on a restarted
-        board."""
+        board.
+        """
 
 
 def find_arm(reference: str) -> type[DrivableArm]:
     """Return the class that "package.module:Class" names. Raises `ValueError` where it is missing
-    or no whole arm."""
+    or no whole arm.
+    """
     return named_class(reference, DrivableArm)

@@ -77,14 +77,16 @@ class LimitGate:
 
     def _gain(self, torque: Array, q: Array, qd: Array) -> Array:
         """Return the change in velocity, rad/s, that torques cause in one cycle at state `q`,
-        `qd`."""
+        `qd`.
+        """
         self._inertia, bias = self._dynamics.terms(q, qd)
         self._resisting = bias + self._dynamics.friction(qd)
         return np.asarray(solve(self._inertia, torque - self._resisting) * self._period_s)
 
     def _nearest(self, gain: Array, least: Array, most: Array) -> Array:
         """Return the torques whose gain in velocity, rad/s a cycle, is nearest to `gain` between
-        `least` and `most`."""
+        `least` and `most`.
+        """
         scale = self._fastest
         per_torque = self._inertia * (scale / self._period_s) / self._torque[:, None]
         offset = self._resisting / self._torque
@@ -208,7 +210,8 @@ class SetPointGate:
         self, arm: BrakedArm, bounds: Bounds, tick_s: float, span_s: float, last: Array
     ) -> None:
         """Keep `bounds` for `span_s`, as later cycles may be missed; `last`, (2, joints), rad,
-        rad/s, is room for the last set point."""
+        rad/s, is room for the last set point.
+        """
         cell = arm.cell
         self._arm = arm
         self._tick_s = tick_s
@@ -269,7 +272,8 @@ class SetPointGate:
 
     def _approached(self, target: JointTarget) -> tuple[Array, bool]:
         """Return the velocity at the end of the cycle, rad/s, and whether the set point stays
-        farther away than a cycle's motion makes up for."""
+        farther away than a cycle's motion makes up for.
+        """
         if not self._by_position:
             return target.velocity, False
         position, velocity = self._last
@@ -291,7 +295,8 @@ class SetPointGate:
 
 def half_planned(bounds: Bounds, limits: Limits) -> Bounds:
     """Return bounds half way from those given to the limits of planned motion, where these are
-    tighter: drives swing over a little."""
+    tighter: drives swing over a little.
+    """
     low, high = bounds.position.T
     least, most = 0.5 * (bounds.position + limits.position).T
     position = np.stack((np.maximum(low, least), np.minimum(high, most)), axis=1)

@@ -27,7 +27,8 @@ TURNS_FROM = 5.0 * FRICTION_SPEED
 
 class FaultyLink:
     """Implements `Link` with injected faults. `acted` collects those that act, for
-    `Executor.acted`."""
+    `Executor.acted`.
+    """
 
     def __init__(
         self,
@@ -37,7 +38,8 @@ class FaultyLink:
         holds: Callable[[], bool] = bool,
     ) -> None:
         """Connect the servo level to an arm; by its `link`, if it has one of its own. `holds`:
-        whether the gripper holds a part, for all that the level knows."""
+        whether the gripper holds a part, for all that the level knows.
+        """
         cell = arm.cell
         self._arm = arm
         self._holds = holds

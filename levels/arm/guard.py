@@ -1,5 +1,6 @@
 """What an arm that does not keep its limits by itself is driven through: its samples are judged,
-and torques cut by them."""
+and torques cut by them.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +22,8 @@ from rack.levels.robot.limits import Bounds
 
 def kept_bounds(cell: Cell, part: float) -> Bounds:
     """Return the bounds of a cell, velocities by `part`, less what samples may be off by. Raises
-    `RobotError` for encoders too coarse to tell a limit."""
+    `RobotError` for encoders too coarse to tell a limit.
+    """
     velocity = part * cell.bounds.velocity
     off = cell.encoders.off
     speed_off = cell.encoders.speed_off
@@ -58,7 +60,8 @@ class GuardedArm:
         self, arm: BrakedArm, tick_s: float, below: Link | None = None, part: float = 1.0
     ) -> None:
         """Guard an arm, sensed by the link `below`, if it has one of its own. Raises `RobotError`
-        for encoders too coarse to tell a limit, velocities by `part`."""
+        for encoders too coarse to tell a limit, velocities by `part`.
+        """
         self._arm = arm
         self._below: Link = below or arm
         self._cell = cell = arm.cell

@@ -1,5 +1,6 @@
 """Samples of an arm behind a bus are some ticks old, and count from elsewhere: its equation of
-motion brings them to the present, `robot.calibration.offset` to the model's positions."""
+motion brings them to the present, `robot.calibration.offset` to the model's positions.
+"""
 
 from __future__ import annotations
 

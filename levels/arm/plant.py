@@ -110,7 +110,8 @@ class Plant:
 
     def restore(self, state: ArmState) -> None:
         """Continue from an `ARM_STATE`: called once, before the first `step`, on a restarted
-        board."""
+        board.
+        """
         self.tick = state.tick
         for name in SAVED:
             setattr(self, name, getattr(state, name))

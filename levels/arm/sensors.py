@@ -59,7 +59,8 @@ class WristSensor:
 
     def sample(self, tick: int) -> Array:
         """Return force, N, and torque, N m, in the sensor's frame, (6,), of the last step before
-        `tick`."""
+        `tick`.
+        """
         sample = np.zeros((2, AXES))  # of which the second row is not used
         sample[0] = self._numbers[self._places]
         self._sense(sample, tick, *self._sensors)
@@ -69,7 +70,8 @@ class WristSensor:
 @compiled_for("f8[:,::1], i8, i8, f8[:,::1], f8[:,::1]")
 def sense_coarsely(sample: Array, tick: int, seed: int, noise: Array, step: Array) -> None:
     """Add noise to a true `sample` (2, joints), of standard deviation `noise`, and round it to
-    multiples of `step`."""
+    multiples of `step`.
+    """
     joints = sample.shape[1]
     chance = uniform(seed, tick, 2 * joints)
     for joint in range(joints):
@@ -88,7 +90,8 @@ def sense_coarsely(sample: Array, tick: int, seed: int, noise: Array, step: Arra
 @compiled_for("i8, i8, i8")
 def uniform(seed: int, tick: int, count: int) -> Array:
     """Return `count` random numbers between 0 and 1, neither included: a function of seed and tick
-    alone."""
+    alone.
+    """
     bits = mixed(np.zeros(count, dtype=np.uint64) + np.uint64(seed))
     bits = mixed(mixed(bits + np.uint64(tick)) + np.arange(count).astype(np.uint64))
     return ((bits >> np.uint64(11)).astype(np.float64) + 0.5) * 2.0**-53

@@ -111,7 +111,8 @@ class SimulatedArm(Simulation, Arm):
 
     def drive(self, torque: Array, grip_force: float) -> Finding | None:
         """Release the brakes and give torques and gripper force for the coming torque cycle; see
-        `Link.drive`."""
+        `Link.drive`.
+        """
         self._grip(grip_force)
         finding = self.refused(torque)
         if finding is not None:
@@ -156,12 +157,14 @@ class SimulatedArm(Simulation, Arm):
 
     def weaken(self, most: Array | None) -> None:
         """Limit the motors to `most` (joints,), N m, from the next command on; None: they are
-        sound."""
+        sound.
+        """
         self._most = most
 
     def step(self, ticks: int) -> None:
         """Simulate `ticks` ticks. After a fault the arm stands still in its last sound state; time
-        continues."""
+        continues.
+        """
         self.contact = None
         for _ in range(ticks):
             if self.waited >= self.patience:
@@ -181,7 +184,8 @@ class SimulatedArm(Simulation, Arm):
 
     def feel(self) -> Array | None:
         """Return the sample of the wrist sensor, (6,), N, N m: that of a substep ago, as MuJoCo's
-        are."""
+        are.
+        """
         return None if self._wrist is None else self._wrist.sample(self.tick)
 
     def save(self, state: ArmState) -> None:
@@ -204,7 +208,8 @@ class SimulatedArm(Simulation, Arm):
 
     def _give(self) -> None:
         """Apply the command to the motors, or the brakes' torque to the joints, through the limit
-        gate."""
+        gate.
+        """
         cell = self.cell
         braked = self.braked
         q, qd = self._state
@@ -224,7 +229,8 @@ class SimulatedArm(Simulation, Arm):
 
     def _braking_torque(self, q: Array, qd: Array) -> Array:
         """Return the torques (joints,), N m, that stop the joints, or hold them where they came to
-        rest, even with the motors off."""
+        rest, even with the motors off.
+        """
         most = self.cell.limits.acceleration
         np.copyto(self._rest, q, where=np.abs(qd) > STANDSTILL)
         wanted = BRAKE_BANDWIDTH**2 * (self._rest - q) - 2.0 * BRAKE_BANDWIDTH * qd
@@ -246,7 +252,8 @@ class CascadedDrives:
         self, cell: Cell, dynamics: Dynamics, tick_s: float, every: int, rows: Array
     ) -> None:
         """Use `rows`, (3, joints): position, rad, and velocity, rad/s, for the end of a cycle, and
-        the torque of the integral, N m."""
+        the torque of the integral, N m.
+        """
         self._rows = rows
         self._dynamics = dynamics
         self._tick_s = tick_s
@@ -261,7 +268,8 @@ class CascadedDrives:
 
     def torque(self, q: Array, qd: Array, waited: int) -> Array:
         """Return the torques, (joints,), N m, of the tick that begins at `q`, `qd`, `waited` ticks
-        after the set point came."""
+        after the set point came.
+        """
         position, velocity, integral = self._rows
         now = position + (waited - self._every) * self._tick_s * velocity
         slip = velocity + self._position_gain * (now - q) - qd

@@ -1,5 +1,6 @@
 """The simulation of a cell: the ticks of a plant in MuJoCo, judged at every step, and what moves by
-itself in it."""
+itself in it.
+"""
 
 from __future__ import annotations
 
@@ -73,7 +74,8 @@ class Simulation(Plant):
 
     def _refresh(self) -> None:
         """Take positions and velocities of the joints from MuJoCo's state, after it was set other
-        than by a step."""
+        than by a step.
+        """
         position, velocity = self._state
         position[:] = self._data.qpos[self.cell.qpos]
         velocity[:] = self._data.qvel[self.cell.dof]
@@ -121,7 +123,8 @@ class Simulation(Plant):
 
     def _look_closer(self, made: int) -> None:
         """Finish a tick in which step `made` failed a check; on a fault, restore the state before
-        the tick."""
+        the tick.
+        """
         touches = self.touches
         self._count_contacts()
         while made < len(self._steps.seen):
@@ -210,7 +213,8 @@ class Simulation(Plant):
 
 def obstacle_position(start: Array, moves: tuple[MotionConfig, ...], time_s: float) -> Array:
     """Return the origin of an obstacle that starts at `start`, (3,), m, at simulated `time_s`; a
-    move that starts before the last one has ended cuts it short."""
+    move that starts before the last one has ended cuts it short.
+    """
     ordered = sorted(moves, key=lambda move: move.at)
     ends = (*(later.at for later in ordered[1:]), np.inf)
     place = start

@@ -28,7 +28,8 @@ PHYSICS = int(mujoco.mjtState.mjSTATE_PHYSICS)
 
 class Substeps(NamedTuple):
     """Further arguments of `advance`, prepared once: few, because each array costs more than the
-    arithmetic on it."""
+    arithmetic on it.
+    """
 
     model: int  # address
     data: int  # address
@@ -52,7 +53,8 @@ class Substeps(NamedTuple):
 
 def substeps(cell: Cell, model: mujoco.MjModel, data: mujoco.MjData, steps: int) -> Substeps:
     """Return the arguments of `advance` for `data` of a cell, whose `model` makes `steps` steps a
-    tick."""
+    tick.
+    """
     bounds = cell.bounds
     high = np.stack((bounds.position[:, 1], bounds.velocity, bounds.torque))
     low = np.stack((bounds.position[:, 0], -bounds.velocity, -bounds.torque))

@@ -97,7 +97,8 @@ class ElementalMoveExecutor(Executor):
 
     def _recall(self, segments: SegmentWindow) -> None:
         """Continue from the last command and status in the mailboxes; the stock of plans is
-        lost."""
+        lost.
+        """
         self._started = True
         self.status.end = self.below.message.position
         if self.last_command.is_there and self.last_status.is_there:
@@ -140,7 +141,8 @@ class ElementalMoveExecutor(Executor):
         self, status: PrimitiveStatus, segments: SegmentWindow, tick: int
     ) -> None:
         """Request another path where the arm rests in front of an obstacle; cancel the request when
-        the way is free."""
+        the way is free.
+        """
         blocked = bool(
             segments.count
             and status.blocked
@@ -292,7 +294,8 @@ class ElementalMoveExecutor(Executor):
 
     def _reason_to_wait(self) -> str:
         """Return the reason why the level waits, and the condition that ends the wait; empty: it
-        does not."""
+        does not.
+        """
         command = self.above
         below = self.below
         if self._orders.stands:

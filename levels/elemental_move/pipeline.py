@@ -1,5 +1,6 @@
 """The executor's plans, which wait until their moves are due, and its segments handed down. The
-level's parameters."""
+level's parameters.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +24,8 @@ the next plan."""
 
 class ElementalMoveParams(Table):
     """Bounds of patience, of grasping, and of the answers from below, in
-    `[board.<name>.params]`."""
+    `[board.<name>.params]`.
+    """
 
     patience: Positive = 60.0
     """time that a move waits for a free path before it is an error, s"""
@@ -40,7 +42,8 @@ class ElementalMoveParams(Table):
 
 class PlanStore:
     """The newest plan of every move from the one under way on, and the answer to the open request
-    for another path."""
+    for another path.
+    """
 
     def __init__(self) -> None:
         self._by_move: dict[int, MovePlan] = {}
@@ -89,7 +92,8 @@ class PlanStore:
 
     def reach(self, window: Any, handed_down: int) -> int:
         """Return the newest move, at least `handed_down`, up to which every motion of `window` has
-        its path."""
+        its path.
+        """
         reached = handed_down
         for move in window:
             if move["id"] == reached + 1:
@@ -102,7 +106,8 @@ class PlanStore:
 
     def end(self, move: int) -> Array | None:
         """Return the end of the newest path up to that of `move`, (joints,), rad; None: there is
-        none."""
+        none.
+        """
         paths = [m for m, plan in self._by_move.items() if m <= move and plan.error == Error.NONE]
         return end_of(self._by_move[max(paths)]) if paths else None
 
@@ -150,7 +155,8 @@ class SegmentWindow:
 
     def take_done(self, done: int) -> Any:
         """Remove and return the oldest segment if its serial is at most `done`; else return
-        None."""
+        None.
+        """
         if not self.count or self._segments["id"][0] > done:
             return None
         taken = self._segments[0].copy()
@@ -173,7 +179,8 @@ class SegmentWindow:
 
     def replace_first(self, plan: MovePlan) -> None:
         """Withdraw all segments; hand down the oldest again along another path, with a new
-        serial."""
+        serial.
+        """
         self._command.count = 1
         self._blank()
         self._command.id = self.first["id"] = self._command.id + 1
@@ -181,14 +188,16 @@ class SegmentWindow:
 
     def add_gripper(self, move: Any, opening: float, force: float) -> None:
         """Hand down a motion of the gripper to `opening`, m or rad, with at most `force`, N or N
-        m."""
+        m.
+        """
         segment = self._add(move, SegmentKind.GRIPPER)
         segment["opening"] = opening
         segment["force"] = force
 
     def end(self, move: int | None = None) -> Array | None:
         """Return the last waypoint (joints,) of the newest path in the window, or of that of
-        `move`; None: there is none."""
+        `move`; None: there is none.
+        """
         for segment in self._segments[: self.count][::-1]:
             if segment["kind"] == SegmentKind.PATH and move in (None, segment["move"]):
                 return np.array(segment["waypoints"][segment["count"] - 1])

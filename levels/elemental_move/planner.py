@@ -1,5 +1,6 @@
 """The planner of the elemental move level: a collision-free path for every move, before it is
-due."""
+due.
+"""
 
 from __future__ import annotations
 
@@ -172,7 +173,8 @@ class ElementalMovePlanner(Planner):
 
     def _requested(self, tick: int) -> PlanningJob | None:
         """Return the job that the executor requests where the arm is blocked; its end stays, for
-        the moves after it."""
+        the moves after it.
+        """
         status = self.status.message
         if not status.replan or (status.replan == self._answered and tick < self._answer_due):
             return None
@@ -215,7 +217,8 @@ class ElementalMovePlanner(Planner):
 
     def _situation(self, move: Move) -> Situation:
         """Return the situation when `move` begins: the world as sensed, changed by the moves before
-        it."""
+        it.
+        """
         world = self.world.message
         held = self.primitive.message.held
         done = self.status.message.done
@@ -233,7 +236,8 @@ class ElementalMovePlanner(Planner):
 
     def _may_try(self, job: PlanningJob, revision: int, tick: int) -> bool:
         """Return whether a job may be tried: a refused one only after a change of the world, or
-        after `retry`."""
+        after `retry`.
+        """
         refusal = self._refusal
         if refusal is None or (refusal.move, refusal.request) != (job.move.id, job.request):
             self._tries = 0
@@ -257,7 +261,8 @@ class ElementalMovePlanner(Planner):
 
 def next_motion(window: Sequence[Move], newest: int) -> Move | None:
     """Return the first motion after move `newest`; None when the window does not reach it without a
-    gap."""
+    gap.
+    """
     for move in window:
         if move.id == newest + 1:
             if move.is_motion:
@@ -268,5 +273,6 @@ def next_motion(window: Sequence[Move], newest: int) -> Move | None:
 
 def grip_of(row: int, tool: Pose, seen: Scene | WorldState) -> Pose:
     """Return the pose of object `row` in the frame of a tool at `tool`; `seen` is a Scene or a
-    WorldState."""
+    WorldState.
+    """
     return tool.inverse() @ pose(seen.position[row], seen.quaternion[row])

@@ -1,2 +1,3 @@
 """Motion along a path in joint space: its geometry, the limits of its parameter, its timing. Pure
-functions of data."""
+functions of data.
+"""

@@ -108,19 +108,22 @@ class BlendedPath:
 
     def pieces_at(self, s: ArrayLike) -> Ints:
         """Return the indices of the pieces that contain `s`; at a break, of the piece that begins
-        there."""
+        there.
+        """
         found = np.searchsorted(self.breaks, s, side="right") - 1
         return np.clip(found, 0, len(self.breaks) - 2)
 
     def sample(self, step_rad: float) -> Array:
         """Return points along the path, both ends included, at most `step_rad` of s apart; (n,
-        joints)."""
+        joints).
+        """
         count = max(int(np.ceil(self.length / step_rad)), 1) + 1 if self.length > 0.0 else 1
         return points_at.load()(self._marks, self._table, np.linspace(0.0, self.length, count))
 
     def _lay_pieces(self) -> tuple[list[tuple[int, float]], list[float]]:
         """Cut the path into lines and corners: return the waypoint of each, with its blend, rad,
-        or 0 for the line that begins there; and their breaks."""
+        or 0 for the line that begins there; and their breaks.
+        """
         last = len(self.waypoints) - 1
         starts: list[float] = self._corners.tolist()
         pieces: list[tuple[int, float]] = []

@@ -65,7 +65,8 @@ SMALLEST_LINEAR_TERM = 1e-12
 
 class SpeedLimits(NamedTuple):
     """Limits of ds/dt and its derivatives, in rad/s, rad/s2, rad/s3; acceleration 0: constant
-    speed."""
+    speed.
+    """
 
     speed: float
     acceleration: float
@@ -124,7 +125,8 @@ def reachable_speed(start: float, length: float, limits: SpeedLimits) -> float:
 
 def boundary_speeds(lengths: Sequence[float], limits: Sequence[SpeedLimits]) -> list[float]:
     """Return the highest speeds at the ends of consecutive stretches, from rest to rest, in
-    rad/s."""
+    rad/s.
+    """
     speeds = [0.0]
     for k, (length, limit) in enumerate(zip(lengths, limits, strict=True)):
         following = limits[k + 1].speed if k + 1 < len(limits) else 0.0
@@ -172,7 +174,8 @@ class Trajectory:
 
     def stretched(self, factor: float) -> Trajectory:
         """Return the same motion slowed by `factor` >= 1; it keeps every limit that this one
-        keeps."""
+        keeps.
+        """
         powers = np.array([factor, 1.0, 1.0 / factor, 1.0 / factor**2, 1.0 / factor**3])
         return Trajectory(self.sections * powers, self.duration * factor)
 
@@ -226,7 +229,8 @@ def make_stop(path: BlendedPath, limits: Limits, state: PathState) -> Trajectory
 
 def _fastest(path: BlendedPath, start: float, end: float, limits: Limits) -> list[Section]:
     """Return the fastest of a few candidates, between two points of rest of a path, that fit into a
-    message."""
+    message.
+    """
     first, last = path.pieces_at((start, end - COINCIDENT_RAD))
     bounds = PathBounds(*(bound[first : last + 1] for bound in path.bounds))
     corners = int(bounds.second.any(axis=1).sum())
@@ -255,7 +259,8 @@ def _fastest(path: BlendedPath, start: float, end: float, limits: Limits) -> lis
 
 def _sections(marks: Sequence[float], limits: Sequence[SpeedLimits]) -> Iterator[Section]:
     """Yield the sections from rest at the first to rest at the last mark, each stretch with its
-    limits."""
+    limits.
+    """
     lengths = [end - start for start, end in pairwise(marks)]
     speeds = boundary_speeds(lengths, limits)
     for start, length, limit, (before, after) in zip(
@@ -291,7 +296,8 @@ def _from(state: PathState, acceleration: float, jerk: float) -> ruckig.InputPar
 
 def _calculated(wanted: ruckig.InputParameter) -> list[Section]:
     """Return the sections of ruckig's answer in one dimension. Raises `ArithmeticError` when it has
-    none."""
+    none.
+    """
     found = ruckig.Trajectory(1)
     result = ruckig.Ruckig(1).calculate(wanted, found)
     if result != ruckig.Result.Working:
@@ -313,7 +319,8 @@ def _joined(rows: Sequence[Section], begin: float) -> Trajectory:
 
 def _keeps(stop: Trajectory, path: BlendedPath, limits: Limits) -> bool:
     """Return whether every joint keeps its limits, by bounds of motion and path over each interval
-    of time."""
+    of time.
+    """
     switches = stop.sections[:, 0]
     times = _checked_times(stop)
     s, ds, dds = stop.states(times)
@@ -339,7 +346,8 @@ def _keeps(stop: Trajectory, path: BlendedPath, limits: Limits) -> bool:
 
 def _checked_times(stop: Trajectory) -> Array:
     """Return the ends of the intervals: evenly spread, and wherever jerk or the sign of dds
-    changes."""
+    changes.
+    """
     start = stop.sections[:, 0]
     dds = stop.sections[:, 3]
     jerk = stop.sections[:, 4]

@@ -1,2 +1,3 @@
 """Planning for an arm: inverse kinematics, collisions, payloads, paths. Deterministic, in any
-process."""
+process.
+"""

@@ -43,7 +43,8 @@ LINK, GRIPPER, LOAD = 1, 2, 4
 
 def place_bodies(cell: Cell, data: mujoco.MjData, positions: Array, quaternions: Array) -> None:
     """Place objects and obstacles in `data` at the world model's poses: (bodies, 3) in m, (bodies,
-    4) as w, x, y, z."""
+    4) as w, x, y, z.
+    """
     for row, address in enumerate(cell.object_qpos):
         data.qpos[address : address + 3] = positions[row]
         data.qpos[address + 3 : address + 7] = quaternions[row]
@@ -123,26 +124,30 @@ class CollisionChecker:
 
     def permit(self, row: int | None, touch: bool = True) -> None:
         """Permit or forbid contact of object `row` with supports and gripper, and a gripper close
-        to supports."""
+        to supports.
+        """
         self._touched = row if touch else None
         self._apply()
 
     def free(self, q: Array, clearance: float | None = None) -> bool:
         """Return whether the arm at `q` (joints,), rad, keeps its distances. `clearance`, m, may
-        lower the scene's."""
+        lower the scene's.
+        """
         self._one[0] = q
         return self.first_blocked(self._one, clearance) == 1
 
     def first_blocked(self, path: Array, clearance: float | None = None) -> int:
         """Return the index of the first of the configurations `path` (n, joints), rad, that is not
-        free; n: all are. Those after it are not looked at."""
+        free; n: all are. Those after it are not looked at.
+        """
         self._least = np.inf if clearance is None else float(clearance)
         held_qpos = -1 if self.held is None else self.cell.object_qpos[self.held]
         return self._first_blocked(held_qpos, self._least, path)
 
     def room(self, q: Array) -> float:
         """Return the largest clearance, in m and at most the scene's, with which `q` is free;
-        negative: with none."""
+        negative: with none.
+        """
         self.free(q)
         short = self._shortfalls()
         pairs = self._data.contact.geom
@@ -156,7 +161,8 @@ class CollisionChecker:
 
     def why(self, q: Array, clearance: float | None = None) -> str:
         """Name the pair of geoms that violates its distance most at `q`, and both distances; empty:
-        `q` is free."""
+        `q` is free.
+        """
         self.free(q, clearance)
         return self.nearest()
 
@@ -174,7 +180,8 @@ class CollisionChecker:
 
     def _shortfalls(self) -> Array:
         """Return by how much each close pair of the last configuration falls short of its required
-        distance, in m."""
+        distance, in m.
+        """
         contact = self._data.contact
         pairs = contact.geom
         return np.asarray(
@@ -183,7 +190,8 @@ class CollisionChecker:
 
     def _longest(self) -> float | None:
         """Return the opening at which the gripper reaches farthest along the tool; None: when
-        open."""
+        open.
+        """
         gripper = self.cell.gripper
         if gripper is None:
             return None
@@ -227,7 +235,8 @@ class CollisionChecker:
 
 def restricted_to_arm(cell: Cell, clearance: float, margin: float) -> mujoco.MjModel:
     """Return a model of the cell in which MuJoCo finds close pairs that involve the arm, a tenth of
-    the work, but for those within the gripper."""
+    the work, but for those within the gripper.
+    """
     model = copy.copy(cell.model)
     solid = (model.geom_contype | model.geom_conaffinity) != 0
     arm = np.isin(np.arange(model.ngeom), cell.arm_geoms)
@@ -286,7 +295,8 @@ def required_distances(
 
 def farthest(model: mujoco.MjModel, data: mujoco.MjData, geoms: Ints, axis: ArrayLike) -> float:
     """Return how far bounding boxes of geoms reach along `axis` (3,), a unit vector, from the
-    origin, m."""
+    origin, m.
+    """
     # A box's extent along an axis: its half sizes times the axis in its own frame.
     along = np.sum(data.geom_xmat[geoms].reshape(-1, 3, 3) * np.reshape(axis, (3, 1)), axis=1)
     centre = model.geom_aabb[geoms, :3]
@@ -320,7 +330,8 @@ def first_blocked(  # noqa: PLR0913  # flat, as `advance` in levels/arm/substeps
     path: Array,  # (n, joints), rad: to be checked
 ) -> int:
     """Bring arm and load to one configuration after another; return the index of the first in which
-    a pair of geoms does not keep its distance; n: all do."""
+    a pair of geoms does not keep its distance; n: all do.
+    """
     for k in range(len(path)):
         for j in range(len(joints)):
             qpos[joints[j]] = path[k, j]

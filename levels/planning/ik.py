@@ -67,7 +67,8 @@ class InverseKinematics:
 
     def reach(self, target: Pose, start: Array, turned: bool = True) -> Array | None:
         """Return the configuration (joints,) at `target` found by one descent from `start`, or
-        None; without `turned` in any orientation."""
+        None; without `turned` in any orientation.
+        """
         q = np.clip(start, self._inner_low, self._inner_high)
         errors: list[float] = []
         for _ in range(MAX_ITERATIONS):
@@ -90,7 +91,8 @@ class InverseKinematics:
 
     def nearby(self, target: Pose, start: Array) -> Array | None:
         """Return the configuration at `target` on the branch of `start`; None: there is none
-        nearby."""
+        nearby.
+        """
         found = self.reach(target, start)
         return (
             found
@@ -116,7 +118,8 @@ class InverseKinematics:
         self, target: Pose, reference: Array, turned: bool = True, restarts: int = MAX_RESTARTS
     ) -> list[Array]:
         """Return distinct configurations at `target`, free or not, the quickest to reach first;
-        without `turned` in any orientation."""
+        without `turned` in any orientation.
+        """
         rng = np.random.default_rng(self._seed)
         found: list[Array] = []
         idle = 0
@@ -134,12 +137,14 @@ class InverseKinematics:
 
     def time_between(self, one: Array, other: Array) -> float:
         """Return the time, in s, of the slowest joint from `one` to `other` at its velocity
-        limit."""
+        limit.
+        """
         return float(np.max(np.abs(one - other) * self._pace))
 
     def _error(self, target: Pose, q: Array) -> Array:
         """Return (6,): the way, m, and the turn, rad, from the tool at `q` to `target`; world
-        frame."""
+        frame.
+        """
         tool = self.tool_at(q)
         turn = np.zeros(3)
         error = np.zeros(6)
@@ -150,7 +155,8 @@ class InverseKinematics:
 
     def _step(self, error: Array, q: Array, turned: bool) -> Array | None:
         """Return the step (joints,), rad, that best reduces `error`, the error at `q`; None: there
-        is none."""
+        is none.
+        """
         m = self._cell.model
         d = self._data
         mujoco.mj_comPos(m, d)

@@ -1,5 +1,6 @@
 """The path of one elemental move: inverse kinematics, then a straight tool line or a search in
-joint space."""
+joint space.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +49,8 @@ def preload() -> None:
 
 class MotionPlanner:
     """Plans elemental moves for one arm. Pure: equal arguments give equal paths, in every
-    process."""
+    process.
+    """
 
     def __init__(self, cell: Cell, scene: SceneConfig, seed: int) -> None:
         self.cell = cell
@@ -101,7 +103,8 @@ class MotionPlanner:
 
     def goal(self, move: Move, start: Array) -> Array:
         """Return the configuration at the end of a free motion, with the checker as it is set.
-        Raises `Refused`."""
+        Raises `Refused`.
+        """
         if move.verb is Verb.MOVE_JOINTS:
             low, high = self.cell.limits.position.T
             beyond = np.flatnonzero((move.joints < low) | (move.joints > high))
@@ -137,7 +140,8 @@ class MotionPlanner:
 
     def _why_no_path(self, start: Array, goal: Array, clearance: float) -> str:
         """Return why a free motion has no path: start or goal is blocked, or the obstacle on the
-        straight line."""
+        straight line.
+        """
         why = self.checker.why(start, clearance) or self.checker.why(goal, clearance)
         if why:
             return why
@@ -164,7 +168,8 @@ class MotionPlanner:
 
     def _clearance_at(self, start: Array) -> float:
         """Return the scene's clearance, or less where an obstacle has come closer to the resting
-        arm."""
+        arm.
+        """
         room = self.checker.room(start)
         return self.clearance if room >= self.clearance else max(CLOSE_PART * room, 0.0)
 

@@ -100,7 +100,8 @@ class Situation:
 
     def holding(self, row: int | None, grip: Pose | None) -> Situation:
         """Return this situation with object `row` in the gripper at `grip` in the tool's frame;
-        None: nothing held."""
+        None: nothing held.
+        """
         return replace(self, held=row, grip=grip)
 
     def with_body(self, row: int, at: Pose) -> Situation:

@@ -218,7 +218,8 @@ class PathPlanner:
 
 class MotionCheck(base.MotionValidator):  # type: ignore[misc]  # untyped
     """Checks a motion where, and in the order in which, OMPL's own validator does, but with one
-    call for all places: a call each took longer than the checks."""
+    call for all places: a call each took longer than the checks.
+    """
 
     def __init__(
         self, information: base.SpaceInformation, values: Callable[..., Array], free: Free
@@ -238,7 +239,8 @@ class MotionCheck(base.MotionValidator):  # type: ignore[misc]  # untyped
 @compiled_for("f8[:,::1], i8")
 def halved(ends: Array, count: int) -> Array:
     """Return the places at which a line between `ends` (2, joints) in `count` parts is checked,
-    (count, joints): its end, its middle, the middles of the halves, and so on."""
+    (count, joints): its end, its middle, the middles of the halves, and so on.
+    """
     places = np.empty((count, ends.shape[1]))
     places[0] = ends[1]
     # First and last mark of each stretch whose middle is a place.

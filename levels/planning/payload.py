@@ -60,7 +60,8 @@ class Payloads:
 
     def check_grip(self, row: int, grip: Pose) -> None:
         """Raise `Refused` with both forces if friction does not hold object `row` at `grip` in the
-        tool's frame."""
+        tool's frame.
+        """
         gravity = float(np.sqrt(np.sum(np.square(self._cell.model.opt.gravity))))
         needed = MIN_GRIP_FACTOR * self._mass(row) * gravity
         holds = self._holding_force(row, grip)
@@ -70,7 +71,8 @@ class Payloads:
 
     def check_motors(self, row: int, grip: Pose, configurations: Array) -> None:
         """Raise `Refused` with both torques if a motor cannot carry object `row` at one of (k,
-        joints), rad."""
+        joints), rad.
+        """
         model = self._cell.model
         centre = grip @ pose(model.body_ipos[self._cell.bodies[row]], (1.0, 0.0, 0.0, 0.0))
         payload = Payload(self._mass(row), centre.position)
@@ -112,7 +114,8 @@ class Payloads:
 
     def _width(self, row: int, grip: Pose) -> float:
         """Return the width of the object on the line through the tool, m; -inf: the line misses
-        it."""
+        it.
+        """
         cell = self._cell
         data = self._data
         address = cell.object_qpos[row]
@@ -164,7 +167,8 @@ class Payloads:
 
     def _nearest(self, geoms: Ints, start: float, way: float) -> tuple[float, int]:
         """Return distance, m, and id of the first geom on the tool's y axis from `start`, m; inf:
-        none."""
+        none.
+        """
         model = self._cell.model
         data = self._data
         tool = self._cell.tool
@@ -187,7 +191,8 @@ class Payloads:
 
 def _friction(model: mujoco.MjModel, one: int, other: int) -> float:
     """Return the sliding friction of a contact of two geoms, as MuJoCo mixes it; 0:
-    frictionless."""
+    frictionless.
+    """
     if model.geom_priority[one] == model.geom_priority[other]:
         mixed = [one, other]
     elif model.geom_priority[one] > model.geom_priority[other]:
@@ -221,7 +226,8 @@ class FixedJaw:
 
     def beside(self, tool: Pose, row: int, seen: Pose) -> Pose:
         """Return the pose of a tool that is to take object `row`, `seen` in the world, moved along
-        its y axis until the jaw is next to the object."""
+        its y axis until the jaw is next to the object.
+        """
         here = site_pose(self._data, self._cell.tool)
         relative = here @ tool.inverse() @ seen
         along = self._side * self._data.site_xmat[self._cell.tool].reshape(3, 3)[:, 1]

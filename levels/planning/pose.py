@@ -54,7 +54,8 @@ class Pose(NamedTuple):
 
     def towards(self, other: Pose, part: float) -> Pose:
         """Return the pose at `part`, 0 to 1, of the straight way to `other`, turning at a constant
-        rate."""
+        rate.
+        """
         quaternion = self.quaternion.copy()
         mujoco.mju_quatIntegrate(quaternion, self._turn_to(other), part)
         return Pose((1.0 - part) * self.position + part * other.position, quaternion)

@@ -1,5 +1,6 @@
 """The primitive level: paths become jerk-limited joint set points, one per cycle, timed in the
-background."""
+background.
+"""
 
 from rack.levels.primitive.executor import PrimitiveExecutor
 from rack.levels.primitive.planner import PrimitivePlanner

@@ -1,5 +1,6 @@
 """The executor of the primitive level: a joint set point every cycle, from paths that its planner
-has timed."""
+has timed.
+"""
 
 from __future__ import annotations
 
@@ -108,7 +109,8 @@ class PrimitiveExecutor(Executor):
 
     def process(self, tick: int) -> None:
         """Read command, status, plan and world model; write the next set point and this level's
-        status."""
+        status.
+        """
         if self._tick is None:
             self._tick = tick - self.context.every
             self._memory = recall(self.last_status, self.last_command)
@@ -197,7 +199,8 @@ class PrimitiveExecutor(Executor):
 
     def _withdraw(self, serials: list[int]) -> bool:
         """Drop work and fault that have left the window; return whether the work must first ramp to
-        rest."""
+        rest.
+        """
         serial = self._work.segment.id if self._work is not None else self._begun
         if serial in serials:
             return False
@@ -249,7 +252,8 @@ class PrimitiveExecutor(Executor):
 
     def _wanted(self, serials: list[int]) -> tuple[int, float]:
         """Return the segment for which a trajectory is wanted, and the path parameter of its start;
-        0: none."""
+        0: none.
+        """
         work = self._work
         kinds = self.above.message.segments["kind"].tolist()
         for serial, kind in zip(serials, kinds, strict=False):
@@ -316,7 +320,8 @@ class PrimitiveExecutor(Executor):
 
     def _reason_to_wait(self) -> str:
         """Return the reason why the level waits, and the condition that ends the wait; empty: it
-        does not."""
+        does not.
+        """
         work = self._work
         command = self.above
         if not self._tracking.in_step:

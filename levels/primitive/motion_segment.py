@@ -68,7 +68,8 @@ def read_segment(command: MoveCommand, serial: int) -> MotionSegment:
 @dataclass
 class Memory:
     """The state with which the executor continues after a restart of its board; its own last
-    messages hold it."""
+    messages hold it.
+    """
 
     is_known: bool = False  # True once this level, restarts included, was in step with the servo
     done: int = 0  # newest segment done

@@ -1,5 +1,6 @@
 """The guard checks the remaining path in every cycle; sight checks that the world model is recent
-enough for motion."""
+enough for motion.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +42,8 @@ class Guard:
 
     def __init__(self, cell: Cell, scene: SceneConfig, lookahead_s: float, delay_s: float) -> None:
         """Look `lookahead_s` ahead; `delay_s` is the time from sensing the world to the set point
-        commanded last."""
+        commanded last.
+        """
         self._checker = CollisionChecker(cell, scene)
         self._clearance = CLEARANCE_PART * scene.clearance
         self._rows = len(scene.bodies)
@@ -58,7 +60,8 @@ class Guard:
 
     def carry(self, row: int, q: Array, world: WorldState) -> None:
         """Carry object `row` with the tool, from its pose in `world` while the arm is at `q`
-        (joints,), rad."""
+        (joints,), rad.
+        """
         seen = Pose(world.position[row], world.quaternion[row])
         self._checker.hold(row, *(self._checker.tool_at(q).inverse() @ seen))
 
@@ -85,7 +88,8 @@ class Guard:
         self, path: BlendedPath, trajectory: Trajectory, time_s: float, world: WorldState
     ) -> bool:
         """Return, by this cycle's share of the checks, whether the path is clear from `time_s`
-        on."""
+        on.
+        """
         begin = trajectory.at(time_s).s
         obstacles = world.velocity[self._objects : self._rows]
         still = bool((np.abs(obstacles) < MAX_REST_M_S).all())
@@ -99,7 +103,8 @@ class Guard:
         self, path: BlendedPath, trajectory: Trajectory, time_s: float, moving: WorldState | None
     ) -> bool:
         """Check the path within the look-ahead; `moving` is the world model while an obstacle
-        moves."""
+        moves.
+        """
         self._phase = (self._phase + 1) % PHASES
         for k in range(NEAR_CHECKS):
             ahead_s = (k + (self._phase + 1) / PHASES) * self._spacing_s
@@ -146,7 +151,8 @@ class Sight:
 
     def __init__(self, guard: Guard, blind_ticks: int, has_bodies: bool) -> None:
         """Treat a scene older than `blind_ticks` as unseen; without bodies there is nothing to
-        see."""
+        see.
+        """
         self._guard = guard
         self._blind_ticks = blind_ticks
         self._has_bodies = has_bodies
@@ -155,7 +161,8 @@ class Sight:
 
     def carry(self, row: int, since: int) -> None:
         """Carry object `row` from its pose in a scene sensed at tick `since` or later; -1: carry
-        nothing."""
+        nothing.
+        """
         self._waiting = (row, since) if row >= 0 else None
         if row < 0:
             self._guard.carry_nothing()

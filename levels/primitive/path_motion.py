@@ -1,5 +1,6 @@
 """Motion of the set point along one path: begun, held, resumed, ended; always at rest or on a
-trajectory."""
+trajectory.
+"""
 
 from __future__ import annotations
 
@@ -64,7 +65,8 @@ class PathMotion:
 
     def rest_at(self, position: Array) -> float:
         """Rest at the start of the path, at `position` (joints,); return the largest joint distance
-        between them."""
+        between them.
+        """
         return self._rest(0.0, position)
 
     def rest_near(self, position: Array, progress: float) -> float:
@@ -95,7 +97,8 @@ class PathMotion:
 
     def hold(self) -> None:
         """Begin to ramp to rest on the path as soon as the braking limits permit; call in every
-        cycle."""
+        cycle.
+        """
         if self.trajectory is None or self.stopping:
             return
         stop = make_stop(self.path, self._braking, self.trajectory.at(self.time_s))

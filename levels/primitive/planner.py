@@ -1,5 +1,6 @@
 """The planner of the primitive level: times the next path, in the background, while the executor
-moves."""
+moves.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +20,8 @@ from rack.levels.tables import read_params
 
 class PrimitivePlanner(Planner):
     """Makes the trajectory that the executor's status requests: of the next segment, or from where
-    a path was held."""
+    a path was held.
+    """
 
     above = Input(MoveCommand, "above.command")
     status = Input(PrimitiveStatus, "own.status")
@@ -77,7 +79,8 @@ class PrimitivePlanner(Planner):
 
     def _path(self, segment: MotionSegment) -> BlendedPath:
         """Return the segment's path. Raises `ValueError` for one that is invalid or leaves a
-        joint's range."""
+        joint's range.
+        """
         path = segment.path()
         low, high = self._positions.T
         outside = np.argwhere((path.waypoints < low) | (path.waypoints > high))
@@ -93,7 +96,8 @@ class PrimitivePlanner(Planner):
 
 class Plans:
     """The executor's copies of plans: the newest trajectory, or refusal, of every segment in the
-    window."""
+    window.
+    """
 
     def __init__(self) -> None:
         self._plans: dict[int, Trajectory | SegmentFault] = {}
@@ -122,7 +126,8 @@ class Plans:
 
     def lacks(self, serial: int, begin: float) -> bool:
         """Return whether there is neither a trajectory from `begin` nor a refusal of the
-        segment."""
+        segment.
+        """
         return self.trajectory(serial, begin) is None and self.refusal(serial) is None
 
     def refusal(self, serial: int) -> SegmentFault | None:

@@ -93,7 +93,8 @@ class WorkRules:
 
 class Quiet:
     """Counts cycles: enough consecutive quiet ones mean settled; too many in total mean that it
-    will never settle."""
+    will never settle.
+    """
 
     def __init__(self, rules: WorkRules) -> None:
         self._wanted_cycles = rules.params.settled_cycles
@@ -209,7 +210,8 @@ class PathWork:
 
     def ends_s(self, due_s: float) -> float:
         """Return the simulated time at which the segment should be done if the set point is due at
-        `due_s`, or 0."""
+        `due_s`, or 0.
+        """
         if self.motion.stopping or (self.motion.resting and not self.motion.finished):
             return 0.0
         return due_s + self.motion.remaining_s + self._rules.latency_s
@@ -236,7 +238,8 @@ class PathWork:
 
     def _timed(self, trajectory: Trajectory, due_s: float) -> Trajectory | None:
         """Stretch the trajectory to end just in time; before the start, refuse one that is too
-        late."""
+        late.
+        """
         if not self.segment.by or not trajectory.duration:
             return trajectory
         available = self.segment.by - self._rules.latency_s - due_s
@@ -259,14 +262,16 @@ class GripperWork:
 
     def begin(self) -> None:
         """Start waiting until the gripper rests: at the start, and when the servo is back in
-        step."""
+        step.
+        """
         self._cycles = 0
         self._quiet = Quiet(self._rules)
 
     @property
     def held_after(self) -> int:
         """The object in the gripper afterwards: the segment's, if the gripper ends nearer to closed
-        than to open; -1: none."""
+        than to open; -1: none.
+        """
         return self.segment.object if self._closes else -1
 
     def done(self, status: DrivenArm) -> bool:

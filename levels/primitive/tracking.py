@@ -83,7 +83,8 @@ class Tracking:
 
 class Straying:
     """Counts cycles in which the arm is off its set point: a few are permitted, and motion holds
-    meanwhile."""
+    meanwhile.
+    """
 
     def __init__(self, joints: Sequence[str], permitted_rad: float, permitted_cycles: int) -> None:
         self._joints = joints

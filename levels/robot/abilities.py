@@ -1,5 +1,6 @@
 """What an arm can do at rest: how far its tool reaches, what it holds there, and how much torque
-gravity leaves."""
+gravity leaves.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +39,8 @@ class Abilities:
 
 def abilities(cell: Cell) -> Abilities:
     """Return what the arm of a cell can do; the worst that is found in many poses, and stretched
-    out."""
+    out.
+    """
     statics = Statics(cell)
     poses = statics.poses()
     far = statics.stretched(max(poses, key=statics.distance))
@@ -70,7 +72,8 @@ class Statics:
 
     def stretched(self, position: Array) -> Array:
         """Return a pose that reaches as far as this one, or farther: each joint in turn at its
-        best."""
+        best.
+        """
         best = position.copy()
         for _ in range(TURNS):
             for joint, (low, high) in enumerate(zip(self._low, self._high, strict=True)):
@@ -89,7 +92,8 @@ class Statics:
 
     def held(self, position: Array) -> tuple[Array, float]:
         """Return the part of each joint's torque that gravity leaves, (joints,), and the mass at
-        the tool, kg, that takes all of one."""
+        the tool, kg, that takes all of one.
+        """
         cell = self._cell
         data = self._data
         data.qpos[cell.qpos] = position

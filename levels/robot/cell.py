@@ -148,7 +148,8 @@ def sensed_by(cell: Cell, robot: RobotConfig, sensors: SensorConfig) -> Cell:
 
 def sizes(cell: Cell) -> dict[str, int]:
     """Return the sizes that the cell gives to messages: joints, bodies (at least 1), state; fingers
-    of a hand."""
+    of a hand.
+    """
     found = {
         "joints": len(cell.qpos),
         "bodies": max(1, len(cell.bodies)),
@@ -165,7 +166,8 @@ def index(
     torque: Array,
 ) -> Cell:
     """Find everything that the config names in the compiled model, the torques of a hand there.
-    Raises `RobotError`."""
+    Raises `RobotError`.
+    """
     joints = np.array([model.joint(name).id for name in robot.joints])
     moved = lookup.below(model, model.jnt_bodyid[joints])
     hand = None if robot.hand is None else find_hand(model, robot, robot.hand)
@@ -293,7 +295,8 @@ def unintended_pairs(
 
 def unintended_contacts(data: mujoco.MjData, touch: Mask, within: float = 0.0) -> NDArray[np.int32]:
     """Return the pairs of geoms, (n, 2), in unintended contact, or `within` a distance, m; `touch`
-    is that of `Cell`."""
+    is that of `Cell`.
+    """
     contact = data.contact
     pairs: NDArray[np.int32] = contact.geom
     return np.asarray(pairs[touch[pairs[:, 0], pairs[:, 1]] & (contact.dist < within)])
@@ -330,7 +333,8 @@ def ease_gripper(cell: Cell, spec: mujoco.MjSpec, config: GripperConfig, tick_s:
 
 def start_qpos(cell: Cell, position: Array) -> Array:
     """Return qpos of a start: arm at `position`, gripper and its linkage open, the rest as in the
-    model."""
+    model.
+    """
     qpos = np.array(cell.model.qpos0)
     qpos[cell.qpos] = position
     if cell.gripper is not None:
@@ -340,7 +344,8 @@ def start_qpos(cell: Cell, position: Array) -> Array:
 
 def check_start(cell: Cell, robot: RobotConfig, key: str, position: Array) -> None:
     """Raise `RobotError` when the start at robot.`key` is outside the limits, too heavy to hold, in
-    unintended contact, or not finite."""
+    unintended contact, or not finite.
+    """
     for name, q, (low, high) in zip(robot.joints, position, cell.limits.position, strict=True):
         if not low <= q <= high:
             raise RobotError(
@@ -373,7 +378,8 @@ def check_start(cell: Cell, robot: RobotConfig, key: str, position: Array) -> No
 
 def check_fingers(cell: Cell, config: GripperConfig) -> None:
     """Raise `RobotError` when couplings yield so far that open or closing fingers settle beyond
-    `config.residual` of where planning poses them, or the gripper does not close."""
+    `config.residual` of where planning poses them, or the gripper does not close.
+    """
     gripper = cell.gripper
     if gripper is None or not gripper.linkage.yields:
         return

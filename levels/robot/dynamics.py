@@ -65,7 +65,8 @@ INERTIA_ROW = 3
 
 class Dynamics:
     """Evaluates the equation of motion of a cell's arm, its fingers open; the same state again
-    costs nothing."""
+    costs nothing.
+    """
 
     def __init__(self, cell: Cell) -> None:
         self._cell = cell
@@ -97,7 +98,8 @@ class Dynamics:
 
     def terms(self, q: Array, qd: Array, payload: Payload | None = None) -> Terms:
         """Return the terms at `q`, rad, and `qd`, rad/s, (joints,) each. The arrays are valid until
-        the next call."""
+        the next call.
+        """
         self._position[:] = q
         self._velocity[:] = qd
         self._evaluate(*self._evaluating)

@@ -35,7 +35,8 @@ LIBRARY = Path(mujoco.__file__).with_name(f"libmujoco.so.{mujoco.mj_versionStrin
 
 class native(compiled[..., None]):  # noqa: N801  # stands for a function
     """A function of MuJoCo that returns nothing. Arguments are integers: addresses, sizes and
-    flags."""
+    flags.
+    """
 
     def __init__(self, name: str, arguments: int) -> None:
         function = getattr(ctypes.CDLL(str(LIBRARY)), name)

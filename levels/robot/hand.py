@@ -29,7 +29,8 @@ NET_FORCE = 1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 3, 1
 @dataclass(frozen=True)
 class Hand:
     """The hand of a cell. Vectors of joints are in the order of `robot.joints`, rows of two:
-    flexors, extensors."""
+    flexors, extensors.
+    """
 
     names: tuple[str, ...]  # of the fingers
     tips: Ints  # (fingers,), sites at their tips
@@ -46,13 +47,15 @@ class Hand:
     @property
     def torque(self) -> Array:
         """Largest torque of a joint either way, (joints,), N m: one tendon at most, the other at
-        least."""
+        least.
+        """
         return np.asarray(self.arms * self.most - self.arms * self.least)
 
 
 def check_hand(robot: RobotConfig, hand: HandConfig) -> None:
     """Raise `RobotError` for a mistake of `[robot.hand]` in itself: lengths of lists, joints of
-    fingers, tensions."""
+    fingers, tensions.
+    """
     if robot.gripper is not None:
         raise RobotError(
             "robot.hand: a hand stands in place of an arm and has no gripper; leave out"
@@ -193,7 +196,8 @@ def find_hand(model: mujoco.MjModel, robot: RobotConfig, hand: HandConfig) -> Ha
 
 def check_tensions(model: mujoco.MjModel, actuators: Ints, least: float) -> None:
     """Raise `RobotError` for an actuator whose control is not the tension, N, of a tendon that only
-    pulls, by more than `least`."""
+    pulls, by more than `least`.
+    """
     low, high = np.moveaxis(model.actuator_ctrlrange[actuators], -1, 0)
     pulls = (
         (model.actuator_trntype[actuators] == mujoco.mjtTrn.mjTRN_TENDON)
@@ -215,7 +219,8 @@ def check_tensions(model: mujoco.MjModel, actuators: Ints, least: float) -> None
 
 def _arms(model: mujoco.MjModel, robot: RobotConfig, actuators: Ints) -> Array:
     """Return the moment arms (joints,), m. Raises `RobotError` where two tendons are no pair of a
-    joint."""
+    joint.
+    """
     joints = np.array([model.joint(name).id for name in robot.joints])
     limited = model.jnt_limited[joints, None]
     places = (
@@ -246,7 +251,8 @@ def _arms(model: mujoco.MjModel, robot: RobotConfig, actuators: Ints) -> Array:
 
 def actuator_moments(model: mujoco.MjModel, joints: Ints, position: Array) -> Array:
     """Return the moments of all actuators on `joints` at a position of these, (actuators, joints),
-    m."""
+    m.
+    """
     data = mujoco.MjData(model)
     moments = np.zeros((model.nu, model.nv))
     data.qpos[model.jnt_qposadr[joints]] = position

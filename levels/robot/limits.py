@@ -58,7 +58,8 @@ class Bounds:
 @dataclass(frozen=True)
 class Limits:
     """Limits of planned motion: the bounds, less some room for tracking, and the config's
-    smoothness."""
+    smoothness.
+    """
 
     position: Array  # (joints, 2), rad: low and high
     velocity: Array  # (joints,), rad/s, both ways
@@ -69,7 +70,8 @@ class Limits:
 @dataclass(frozen=True)
 class Encoders:
     """Resolution and noise of the joints' sensors; of velocities, rad/s, they are these over
-    `EDGE_TIMING_S`."""
+    `EDGE_TIMING_S`.
+    """
 
     resolution: Array  # (joints,), rad: step of a position
     noise: Array  # (joints,), rad: standard deviation of a position

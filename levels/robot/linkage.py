@@ -189,7 +189,8 @@ class _Solver:
 
     def farthest(self) -> tuple[float, int]:
         """Return by how much the last pose leaves an equality open at most, m or rad, and its
-        id."""
+        id.
+        """
         data = self._data
         jacobian = self._jacobian()
         ours = np.any(jacobian[:, [*self._dof, self._driven_dof]] != 0.0, axis=1)
@@ -225,7 +226,8 @@ class _Solver:
 
     def _rows(self) -> tuple[Array, Array, Array]:
         """Return residuals (rows,), their Jacobian (rows, joints), and the force per residual
-        (rows,) in the simulation: of equalities, and of joint stops that are exceeded."""
+        (rows,) in the simulation: of equalities, and of joint stops that are exceeded.
+        """
         data = self._data
         jacobian = self._jacobian()[:, self._dof]
         counts = (data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY) | (data.efc_pos < 0.0)
@@ -236,7 +238,8 @@ class _Solver:
 
     def _stretched(self, most: float) -> tuple[Array, Array]:
         """Return the rows of tendons that are springs, (tendons,) and (tendons, joints), their
-        stiffness a part of `most`."""
+        stiffness a part of `most`.
+        """
         model = self._model
         jacobian = tendon_jacobian(model, self._data)[self._tendons]
         parts = np.sqrt(model.tendon_stiffness[self._tendons] / most)
@@ -252,7 +255,8 @@ class _Solver:
 
 def check_commanded(model: mujoco.MjModel, config: GripperConfig, carried: Mask) -> None:
     """Raise `RobotError` for an actuator, not the gripper's own, of a joint of those `carried`
-    (njnt,) by the hand."""
+    (njnt,) by the hand.
+    """
     for k in range(model.nu):
         name = model.actuator(k).name
         joint = int(model.actuator_trnid[k, 0])

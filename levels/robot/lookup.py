@@ -1,5 +1,6 @@
 """Look up the names of a config in a compiled model. Every mistake is one `RobotError` that lists
-the valid names."""
+the valid names.
+"""
 
 from __future__ import annotations
 
@@ -46,7 +47,8 @@ def find_all(
 
 def unknown_names(robot: RobotConfig, scene: SceneConfig) -> Iterator[str]:
     """Yield a line for every name in the config that the model lacks. Raises `RobotError` for a
-    broken model."""
+    broken model.
+    """
     model = compile_spec(load_spec(robot.model), robot.model)
     kind = mujoco.mjtObj
     is_body = mujoco.mj_name2id(model, kind.mjOBJ_BODY, robot.tool) >= 0

@@ -55,7 +55,8 @@ def load_spec(path: Path) -> mujoco.MjSpec:
 
 def compile_spec(spec: mujoco.MjSpec, path: Path) -> mujoco.MjModel:
     """Compile. Inertias of bodies that never move are given up if they are what MuJoCo refuses.
-    Raises `RobotError` with MuJoCo's reason in one line."""
+    Raises `RobotError` with MuJoCo's reason in one line.
+    """
     try:
         return spec.compile()
     except (ValueError, RuntimeError, mujoco.FatalError) as problem:
@@ -66,7 +67,8 @@ def compile_spec(spec: mujoco.MjSpec, path: Path) -> mujoco.MjModel:
 
 def drop_fixed_inertias(body: mujoco.MjsBody) -> bool:
     """Give all below `body` that no joint moves the inertia of its geoms; return whether any stated
-    another."""
+    another.
+    """
     found = False
     # Lists of children repeat the error of a compilation that failed.
     child = body.first_body()
@@ -91,7 +93,8 @@ def check_number(joints: Sequence[str]) -> None:
 
 def check_joints(robot: RobotConfig, spec: mujoco.MjSpec) -> None:
     """Raise `RobotError` for a list of the wrong length, and for a joint that is missing, not
-    scalar or named twice."""
+    scalar or named twice.
+    """
     for key, _, why in robot.misfits():
         raise RobotError(f"robot.{key}: {why}")
     for name in robot.joints:
@@ -110,7 +113,8 @@ def check_joints(robot: RobotConfig, spec: mujoco.MjSpec) -> None:
 
 def prepare(spec: mujoco.MjSpec, robot: RobotConfig, clock_ns: int) -> None:
     """Set what the servo level needs in any model: integrator, time step, drive inertia, tool,
-    gripper, keyframe."""
+    gripper, keyframe.
+    """
     option = spec.option
     option.timestep = clock_ns * 1e-9 / robot.substeps
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -199,7 +203,8 @@ def fit_gripper(spec: mujoco.MjSpec, gripper: GripperConfig) -> None:
 
 def couple(spec: mujoco.MjSpec, gripper: GripperConfig, follower: FollowConfig) -> None:
     """Make a joint follow the gripper's driven one, in place of its own actuators. Raises
-    `RobotError`."""
+    `RobotError`.
+    """
     for name in (follower.joint, gripper.joint):
         if spec.joint(name) is None:
             have = listed([j.name for j in spec.joints])
@@ -239,7 +244,8 @@ def driven_by(spec: mujoco.MjSpec, actuator: mujoco.MjsActuator) -> list[str]:
 
 def stated_torque(spec: mujoco.MjSpec, joint: str, drives: Iterable[mujoco.MjsActuator]) -> float:
     """Return the tightest torque limit that a model states for a joint, N m. 0 where it states none
-    that a `[robot]` table may have, such as infinity."""
+    that a `[robot]` table may have, such as infinity.
+    """
     own = spec.joint(joint)
     found = [reach(own.actfrclimited, own.actfrcrange)]
     found += [drive_limit(a) for a in drives if a.trntype in JOINT_DRIVES and a.target == joint]

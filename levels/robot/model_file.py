@@ -237,7 +237,8 @@ def find_file(paths: Iterable[Path]) -> Path | None:
 
 def check_asset(file: Path, model: Path) -> None:
     """Raise `RobotError` for an asset of a model that is no regular file, or too large, also once
-    it is decoded."""
+    it is decoded.
+    """
     try:
         check_regular_file(file, ASSET_BYTES)
         with file.open("rb") as opened:

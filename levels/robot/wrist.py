@@ -1,5 +1,6 @@
 """The wrist sensor of an arm, as the model describes it: where it is, its range, and the limits on
-contact."""
+contact.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +23,8 @@ KINDS = {
 
 class Wrist(NamedTuple):
     """A force/torque sensor at a site. Forces are N, torques N m; of two values the first is the
-    force's."""
+    force's.
+    """
 
     site: int
     addresses: Ints  # (6,), of its numbers in sensordata
@@ -33,7 +35,8 @@ class Wrist(NamedTuple):
 
 def find_wrist(model: mujoco.MjModel, config: WristConfig | None, moved: Mask) -> Wrist | None:
     """Return the sensor on one of the bodies `moved` (nbody,) by the arm; None: there is none.
-    Raises `RobotError`."""
+    Raises `RobotError`.
+    """
     if config is None:
         return None
     names = (config.force, config.torque)

@@ -134,7 +134,8 @@ class ActuatorMonitor:
 
     def _lacking(self, velocity: Array, holds: bool) -> Finding | None:
         """Follow cycles in which motors that lack torque explain the difference, until it is
-        certain."""
+        certain.
+        """
         motors = self._motors
         left = motors["left"]
         noise = motors["noise"]
@@ -208,7 +209,8 @@ def left_over(
     bias: Array,  # (joints,), N m: now
 ) -> int:
     """Compare the torques that a motion took with those commanded; keep the present state for the
-    next cycle."""
+    next cycle.
+    """
     position, velocity = state
     verdict = EXPLAINED
     for j in range(len(motors)):

@@ -1,5 +1,6 @@
 """Control modifications for any arm: a dead zone before the law, PD control in its place, a notch
-after it."""
+after it.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +24,8 @@ class DeadZoneParams(Table):
 
 class DeadZone(Modification):
     """Hides small position errors from the law, and reduces larger ones by as much: sticking joints
-    do not hunt."""
+    do not hunt.
+    """
 
     hook = Hook.BEFORE
     params = DeadZoneParams
@@ -51,7 +53,8 @@ class JointPdParams(Table):
 
 class JointPd(Modification):
     """Controls every joint by itself: PD on its error, without acceleration, coupling or
-    friction."""
+    friction.
+    """
 
     hook = Hook.INSTEAD
     params = JointPdParams

@@ -1,5 +1,6 @@
 """The servo level's loops: computed torque for the joints, a position loop with limited force for
-the gripper."""
+the gripper.
+"""
 
 from __future__ import annotations
 
@@ -68,7 +69,8 @@ class LawParams(ModifiableParams, ArmParams):
 
 class ServoParams(LawParams, LoopGains):
     """`[board.servo.params]`: the arm, gains of the joint loop, and the reactions to faults of
-    sensors and motors."""
+    sensors and motors.
+    """
 
 
 class ComputedTorque:
@@ -97,7 +99,8 @@ class ComputedTorque:
 
     def torque(self, wanted: Motion, sensed: SensedMotion, terms: Terms) -> Array:
         """Return the torques, (joints,), N m, for the wanted motion; `terms` are those at the
-        sensed state. Valid until the next call."""
+        sensed state. Valid until the next call.
+        """
         inertia = terms.inertia if self.inertia is None else self.inertia
         self._set(wanted.table, sensed.table, inertia, terms.bias)
         return self._torque
@@ -152,7 +155,8 @@ class SetPointLaw:
 
     def target(self, wanted: Motion, position: Array, torque: Array) -> JointTarget:
         """Return the set points for a motion, with the arm at `position`, (joints,), rad, and
-        `torque`, (joints,), N m, predicted."""
+        `torque`, (joints,), N m, predicted.
+        """
         gained = self._period_s * wanted.acceleration
         return JointTarget(
             wanted.position + self._period_s * (wanted.velocity + 0.5 * gained),
@@ -178,7 +182,8 @@ class Grip:
 
     def keep(self, force: float) -> None:
         """Keep `force`, N or N m, until the first set point: the grip on an object must survive
-        a restart of the board."""
+        a restart of the board.
+        """
         self._kept = force
 
     def take(self, command: ArmSetPoint) -> None:

@@ -19,7 +19,8 @@ REST = 6
 
 class Motion:
     """Joint positions, rad, velocities, rad/s, and accelerations, rad/s2, (joints,) each: the rows
-    of `table`."""
+    of `table`.
+    """
 
     __slots__ = ("acceleration", "position", "table", "velocity")
 
@@ -43,7 +44,8 @@ class Curve:
 
     def __init__(self, *coefficients: Array, duration_s: float, rest: Array | None = None) -> None:
         """Take coefficients of u^0, u^1, ..., rad; without `rest`, rad, the motion goes on after
-        `duration_s`."""
+        `duration_s`.
+        """
         self.table: Array = np.zeros((REST + 1, len(coefficients[0])))  # (7, joints), rad
         self.table[: len(coefficients)] = coefficients
         self.duration_s = duration_s
@@ -63,7 +65,8 @@ def set_motion(
     table: Array, duration_s: float, ends_s: float, time_s: float, ahead_s: float, motion: Array
 ) -> None:
     """Set position, velocity and, `ahead_s` later, acceleration, (3, joints), to those on a
-    curve."""
+    curve.
+    """
     h = duration_s
     u = time_s / duration_s
     later = (time_s + ahead_s) / duration_s
@@ -111,7 +114,8 @@ class Bridge(Curve):
 
     def is_within(self, acceleration: Array) -> bool:
         """Return whether no joint needs more than its `acceleration`, rad/s2: the need is greatest
-        at one of the ends."""
+        at one of the ends.
+        """
         begin = 2.0 * self.table[2] / self.duration_s**2
         end = (2.0 * self.table[2] + 6.0 * self.table[3]) / self.duration_s**2
         return bool(np.all((np.abs(begin) <= acceleration) & (np.abs(end) <= acceleration)))
@@ -119,7 +123,8 @@ class Bridge(Curve):
 
 class Ramp(Curve):
     """From a velocity to rest, all joints at the same time, so that they stay on a straight line;
-    then rest."""
+    then rest.
+    """
 
     def __init__(self, start: Array, velocity: Array, acceleration: Array) -> None:
         """Decelerate no joint harder than its `acceleration`, rad/s2."""
@@ -130,11 +135,13 @@ class Ramp(Curve):
 
 class Decay(Curve):
     """A difference in position and velocity that decays: a quintic that ends with all derivatives
-    zero; then 0."""
+    zero; then 0.
+    """
 
     def __init__(self, position: Array, velocity: Array, fastest: Array, hardest: Array) -> None:
         """Last as long as it takes to add at most about `fastest`, rad/s, and `hardest`, rad/s2, to
-        a motion."""
+        a motion.
+        """
         # Peaks of the quintic over a time T: 1.875 p / T in velocity; 5.774 p / T^2 + 3.94 v / T in
         # acceleration.
         linear = 3.94 * np.abs(velocity)
@@ -154,11 +161,13 @@ class Decay(Curve):
 
 class Passage(Decay):
     """From rest to rest at another place, all joints at the same time, straight in joint space;
-    then rest."""
+    then rest.
+    """
 
     def __init__(self, start: Array, end: Array, fastest: Array, hardest: Array) -> None:
         """Last as long as it takes to keep every joint within `fastest`, rad/s, and `hardest`,
-        rad/s2."""
+        rad/s2.
+        """
         super().__init__(start - end, np.zeros_like(start), fastest, hardest)
         self.table[0] += end
         self.table[REST] += end

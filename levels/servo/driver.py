@@ -1,5 +1,6 @@
 """The part of a level that drives an arm, whatever it drives it to: sense, decide, drive or brake,
-report."""
+report.
+"""
 
 from __future__ import annotations
 
@@ -123,7 +124,8 @@ class ArmDriver(Executor):
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Misfits:
         """Yield a hand, whose tendons have a board of another kind, and an arm whose samples are
-        too coarse to guard it."""
+        too coarse to guard it.
+        """
         robot = context.robot
         given = context.params.get("arm")
         if given is not None and not find_arm(given).keeps_limits:
@@ -171,7 +173,8 @@ class ArmDriver(Executor):
     @abstractmethod
     def efforts(self, wanted: Motion, sensed: Sensed) -> tuple[Array, float]:
         """Return torques, (joints,), N m, and grip force, N, for the wanted motion, at the `terms`
-        of the cycle."""
+        of the cycle.
+        """
 
     @property
     @abstractmethod
@@ -190,7 +193,8 @@ class ArmDriver(Executor):
     @property
     def has_work(self) -> bool:
         """Whether the level has work from which it can be kept. Default: once there was a
-        command."""
+        command.
+        """
         return self.followed > 0
 
     @property
@@ -208,14 +212,16 @@ class ArmDriver(Executor):
 
     def feel(self, tick: int) -> None:
         """Sense more than the joints, before it is decided whether the arm stops. Default:
-        nothing."""
+        nothing.
+        """
 
     def adopted(self) -> None:
         """React to an arm that has been enabled, wherever it is. Default: nothing."""
 
     def started(self) -> None:
         """React to the start of a board whose arm was restored from its last state. Default:
-        nothing."""
+        nothing.
+        """
 
     def process(self, tick: int) -> None:
         """Advance the arm to `tick`, sense, drive or brake, report."""
@@ -258,7 +264,8 @@ class ArmDriver(Executor):
 
     def _catch_up(self, before: Reading[ArmState], tick: int) -> bool:
         """Advance the arm to `tick`; return whether cycles were missed. A restarted board first
-        restores the arm."""
+        restores the arm.
+        """
         if not self._started:
             state = before.message if before.is_there else None
             self._start(state, tick)
@@ -273,7 +280,8 @@ class ArmDriver(Executor):
 
     def _is_judged(self, sensed: Sensed, tick: int) -> bool:
         """Return whether this sample can be judged: until the arm is enabled, it only says where
-        the arm is, and may be missing."""
+        the arm is, and may be missing.
+        """
         is_enabled = self.enabling.is_enabled
         if self._adopted and is_enabled:
             return True
@@ -304,7 +312,8 @@ class ArmDriver(Executor):
 
     def _drive(self, sensed: Sensed, reaction: Reaction, missed: bool, tick: int) -> None:
         """Do one cycle with torques; brake when a motor fails, a torque is refused or a stop is
-        complete."""
+        complete.
+        """
         wanted = self.next_motion(reaction, missed, tick)
         if wanted is None:
             return self.brake()
@@ -333,7 +342,8 @@ class ArmDriver(Executor):
 
     def _report(self, sensed: Sensed, reaction: Reaction) -> None:
         """Fill the status, and the estimate in the state; the steady fields only when they
-        change."""
+        change.
+        """
         arm = self.arm
         status = self.status
         if self._numbers is None:
@@ -405,7 +415,8 @@ class ArmDriver(Executor):
 
 def numbers(message: Message, first: str, last: str) -> Array:
     """Return a view of the fields from `first` to `last`, which are adjacent numbers, as one
-    array."""
+    array.
+    """
     fields = message.record.dtype.fields
     assert fields is not None
     begin = fields[first][1]

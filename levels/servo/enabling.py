@@ -1,5 +1,6 @@
 """Whether the arm is enabled: asks its drives at the start or by an operator's command, and says
-what they wait for."""
+what they wait for.
+"""
 
 from __future__ import annotations
 

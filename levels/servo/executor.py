@@ -15,7 +15,8 @@ from rack.levels.servo.law import ServoLaw
 
 class ServoExecutor(ServoLaw):
     """Follows joint set points by computed torque or, with drives that close loops of their own, by
-    set points for them."""
+    set points for them.
+    """
 
     params: ClassVar[type[ServoParams]] = ServoParams
     settings: ServoParams

@@ -89,7 +89,8 @@ class LawSample:
 
     def __setattr__(self, name: str, value: Any) -> None:
         """Fill a vector in place: `sample.torque = 0.9 * sample.torque` changes what the law's
-        caller sees."""
+        caller sees.
+        """
         if isinstance(getattr(self, name, None), np.ndarray):
             getattr(self, name)[...] = value
         else:
@@ -121,7 +122,8 @@ class Modification(ABC):
 
 class ModificationConfig(Table):
     """`[board.<name>.params.modifications.<modification>]`: one modification of the board's servo
-    law."""
+    law.
+    """
 
     cls: str = Field(alias="class")
     """subclass of rack.levels.servo.Modification, package.module:Class"""
@@ -185,7 +187,8 @@ class ModifiableParams(Table):
 
 def names_of(params: Mapping[str, Any]) -> Sequence[str]:
     """Return the names of the modifications in a board's parameters, valid or not: see
-    `Executor.names`."""
+    `Executor.names`.
+    """
     found = params.get("modifications")
     return tuple(found) if isinstance(found, Mapping) else ()
 

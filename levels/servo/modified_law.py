@@ -58,7 +58,8 @@ class Modified:
 
     def act(self, sample: LawSample, changed: Array) -> str:
         """Modify a sample, of which it changes one array; return why that failed, empty: it did
-        not."""
+        not.
+        """
         kept = changed.copy()
         why = ""
         try:
@@ -113,7 +114,8 @@ class ModifiedLaw:
 
     def switch(self, name: str, is_on: bool) -> str:
         """Put a modification in, or take it out, with the next sample; return why that is refused,
-        empty: it is not."""
+        empty: it is not.
+        """
         one = self._all.get(name)
         if one is None:
             return f"no modification '{name}'; permitted: {', '.join(self._all) or 'none'}"

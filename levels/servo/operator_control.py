@@ -1,5 +1,6 @@
 """An operator's commands to the servo level: hold, or move the joints to a set point, and later
-return the same way."""
+return the same way.
+"""
 
 from __future__ import annotations
 

@@ -38,7 +38,8 @@ class SetPoint(NamedTuple):
 
 class Reference:
     """Interpolates set points: `take` takes them, and tick by tick `at(tick)` gives the motion
-    wanted at that tick."""
+    wanted at that tick.
+    """
 
     def __init__(self, bounds: Bounds, limits: Limits, tick_s: float) -> None:
         self._limits = limits
@@ -77,7 +78,8 @@ class Reference:
 
     def meet(self, position: Array, velocity: Array, tick: int, astray: float = ASTRAY_RAD) -> None:
         """Start from where the arm is after missed cycles, if it has strayed as far as `astray`,
-        rad, and lead it back to the set points."""
+        rad, and lead it back to the set points.
+        """
         now = self._motion(tick)
         if np.max(np.abs(now.position - position)) < astray:
             return
@@ -88,13 +90,15 @@ class Reference:
 
     def take(self, command: ArmSetPoint) -> None:
         """Take a new `JOINT_SET_POINT`. It must stay the newest message until the next one is
-        taken."""
+        taken.
+        """
         self._command = command
         self._offered = command.due
 
     def at(self, tick: int) -> Motion:
         """Return the motion wanted at `tick`, by the set points taken; its acceleration is
-        mid-cycle."""
+        mid-cycle.
+        """
         if self._next is not None and (self.holding or tick >= self._due):
             self._advance(self._next, tick)
         offered = self._offered
@@ -136,7 +140,8 @@ class Reference:
 
     def _receive(self, due: int, tick: int) -> None:
         """Copy the set point offered. It waits until the one before it is due: some protocols
-        deliver early."""
+        deliver early.
+        """
         command = self._command
         if command is None:
             return

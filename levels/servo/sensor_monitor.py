@@ -368,7 +368,8 @@ def check(  # noqa: PLR0913  # flat, as `advance` in levels/arm/substeps.py
     faulty: bool,
 ) -> int:
     """Check a sample against the estimate, and take it if nothing is in doubt; return the
-    verdict."""
+    verdict.
+    """
     position, velocity, doubt = estimate
     good = not faulty
     in_doubt = False

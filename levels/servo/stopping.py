@@ -122,7 +122,8 @@ class Stopping:
         self, blow: Cause, finding: Finding, tick: int, reaction: Reaction = Reaction.BRAKE
     ) -> None:
         """Register a blow: a contact that is unintended or too strong, or a joint beyond its limit;
-        with the reaction to it."""
+        with the reaction to it.
+        """
         is_new = self._struck_until is None or blow.error is not self._blow.error
         # The arm may have reported it by itself, in this cycle.
         if is_new and all(one.alarm is not finding.alarm for one in self.findings):
@@ -133,7 +134,8 @@ class Stopping:
 
     def wait(self, error: Error, why: str, tick: int) -> Reaction:
         """Return the reaction of this cycle while the arm is not enabled, which no patience
-        bounds: `error` is DISABLED or DRIVES."""
+        bounds: `error` is DISABLED or DRIVES.
+        """
         self._tick = tick
         if not self.error:
             self.cause = error
@@ -179,7 +181,8 @@ class Stopping:
 
     def _wait_for(self, cause: Cause, tick: int) -> None:
         """Set `cause` and `reason`: the fault that must end, and the tick at which it is
-        latched."""
+        latched.
+        """
         self.cause = cause.error
         self.reason = f"{cause.text}{cause.then}; latched at tick {tick + self._most - self._kept}"
 

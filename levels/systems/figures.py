@@ -1,5 +1,6 @@
 """The level of the paper's Gantt charts (section 3.4, figures 2 to 4): it only consumes processor
-time."""
+time.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +39,8 @@ Milliseconds = Annotated[float, Parameter(ge=0, le=10_000, allow_inf_nan=False)]
 
 class FigureParams(Table):
     """Processor times of the level's unit functions; R, W, U and C are the bus's, in
-    `[board.<name>.transfer]`."""
+    `[board.<name>.transfer]`.
+    """
 
     process_ms: Milliseconds | Annotated[tuple[Milliseconds, ...], Parameter(min_length=1)] = 2.0
     """X: the executor in a cycle, ms; several times are taken in turn, cycle by cycle"""

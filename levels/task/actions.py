@@ -49,7 +49,8 @@ class Way(NamedTuple):
 
 def rehearse(program: TaskConfig, scene: SceneConfig, start: Rehearsal) -> Rehearsal:
     """Return the whole program as moves, rehearsed. Raises `Refused` with action, place and a
-    possible alternative."""
+    possible alternative.
+    """
     rehearsal = start
     for k, action in enumerate(program.action):
         if isinstance(action, Transfer):
@@ -103,7 +104,8 @@ def goto(rehearsal: Rehearsal, k: int, action: Goto) -> Rehearsal:
 
 def transfer(rehearsal: Rehearsal, k: int, action: Transfer, scene: SceneConfig) -> Rehearsal:
     """Return the rehearsal after a transfer. Raises `Refused` that names the step, pick or
-    place."""
+    place.
+    """
     handling = Handling(rehearsal, scene.objects.index(action.object), action.lift)
     pick = f"pick {action.object}"
     place = f"place {action.object} at [{', '.join(f'{value:.4g}' for value in action.to)}]"
@@ -138,7 +140,8 @@ def transfer(rehearsal: Rehearsal, k: int, action: Transfer, scene: SceneConfig)
 
 class Handling(NamedTuple):
     """A transfer as planning sees it: the tool goes straight down to the object and straight up
-    again."""
+    again.
+    """
 
     start: Rehearsal
     row: int  # of the object
@@ -146,7 +149,8 @@ class Handling(NamedTuple):
 
     def takes(self) -> Iterator[list[Spot]]:
         """Yield the spots to take and hold the object, at the lowest possible height first. Raises
-        the first `Refused` when there are none."""
+        the first `Refused` when there are none.
+        """
         start = self.start
         refusal: Refused | None = None
         is_taken = False
@@ -172,7 +176,8 @@ class Handling(NamedTuple):
 
     def ways(self, takes: list[Spot], standing_goals: list[Pose]) -> list[Way]:
         """Return ways to do the transfer, the quickest to move first. Raises `Refused` when there
-        is none."""
+        is none.
+        """
         situation = self.start.situation
         here = self.start.q
         ways: list[Way] = []
@@ -196,7 +201,8 @@ class Handling(NamedTuple):
 
     def moved(self, rehearsal: Rehearsal, k: int, spot: Spot, verb: Verb) -> Rehearsal:
         """Return the rehearsal after the four moves of a grasp or a release for action `k`. Raises
-        `Refused`."""
+        `Refused`.
+        """
         above = spot.tool.raised(self.lift)
         row = self.row
         over = None if verb is Verb.GRASP else row
@@ -207,7 +213,8 @@ class Handling(NamedTuple):
 
     def _spots(self, tool: Pose, situation: Situation, grasps: bool = False) -> list[Spot]:
         """Return the free configurations above `tool` from which the arm can come down to it and,
-        if it `grasps` there, close the gripper."""
+        if it `grasps` there, close the gripper.
+        """
         motion = self.start.motion
         situation.lay_out(motion.checker, None)
         restarts = LEANING_RESTARTS if leans(tool) else MAX_RESTARTS
@@ -224,7 +231,8 @@ class Handling(NamedTuple):
 
     def _held(self, takes: list[Spot]) -> list[Spot]:
         """Return the spots where gripper and motors can hold the object. Raises the first `Refused`
-        when none can."""
+        when none can.
+        """
         payloads = self.start.motion.payloads
         seen = self.start.situation.object_pose(self.row)
         held: list[Spot] = []
@@ -243,14 +251,16 @@ class Handling(NamedTuple):
 
     def _nothing_at(self, tools: list[Pose]) -> Refused:
         """Return the refusal for poses that the arm cannot reach from above, or only in
-        collision."""
+        collision.
+        """
         places = [place for tool in tools for place in (tool, tool.raised(self.lift))]
         return _nothing_at(self.start.motion, places, self.start.q)
 
 
 def _first(options: Iterable[Option], do: Callable[[Option], Rehearsal]) -> Rehearsal:
     """Return the first rehearsal that succeeds. Raises the `Refused` of the first option when none
-    does."""
+    does.
+    """
     refusals: list[Refused] = []
     for option in options:
         try:

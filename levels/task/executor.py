@@ -95,7 +95,8 @@ class TaskExecutor(Executor):
 
     def _recall(self) -> None:
         """Continue from the last command and status in the mailboxes, after a restart of the
-        board."""
+        board.
+        """
         self._started = True
         last = self.last_status.message
         self._done = last.moves_done
@@ -108,7 +109,8 @@ class TaskExecutor(Executor):
 
     def _judge(self, command: OperatorCommand, answered: int) -> None:
         """Accept or refuse a goto; one already answered before a restart of this board is not
-        new."""
+        new.
+        """
         if self._orders.standing is Operation.GOTO:
             self._detour.begin(command, command.id > answered)
 
@@ -134,7 +136,8 @@ class TaskExecutor(Executor):
 
     def _reason_to_wait(self, below: Reading[MoveStatus]) -> str:
         """Return the reason why the level waits, and the condition that ends the wait; empty: it
-        does not."""
+        does not.
+        """
         orders = self._orders
         if orders.standing is Operation.GOTO:
             return self._detour.reason()
@@ -203,7 +206,8 @@ class TaskExecutor(Executor):
 
     def _answer(self, below: MoveStatus) -> None:
         """Obey and answer the operator, and pass down the newest command on which this cycle is
-        based."""
+        based.
+        """
         orders = self._orders
         self.command.hold = orders.holds or self._detour.holds
         self.command.operator = orders.rests_on(0)

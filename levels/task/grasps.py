@@ -68,7 +68,8 @@ def grasps(cell: Cell, situation: Situation, row: int) -> Iterator[list[Pose]]:
 
 def leaning(yaw: float, tilt: float) -> Array:
     """Return the quaternion of a tool that points down but for `tilt`, rad, towards `yaw`; its y
-    axis is level."""
+    axis is level.
+    """
     across = math.sin(tilt)
     return pointing((across * math.cos(yaw), across * math.sin(yaw), -math.cos(tilt)), yaw)
 
@@ -88,7 +89,8 @@ def bearing(cell: Cell, position: Array) -> float:
 
 def goals(action: Transfer, at: Pose, cell: Cell) -> Iterator[list[Pose]]:
     """Yield the poses in which the object may be put down, in the order of trying: upright as it is
-    now, turned about the vertical by quarters, then by what lies between."""
+    now, turned about the vertical by quarters, then by what lies between.
+    """
     yaw = yaw_of(at.quaternion)
     if action.yaw is not None:
         yield [_turned(action, at, action.yaw - yaw)]
@@ -142,7 +144,8 @@ def standing(cell: Cell, data: mujoco.MjData, row: int, situation: Situation) ->
 
 def _geom_below(cell: Cell, data: mujoco.MjData, row: int, point: Array) -> int:
     """Return the first geom below `point` that is neither object `row` nor the arm; -1: there is
-    none."""
+    none.
+    """
     found = np.full(1, -1, dtype=np.int32)
     body = int(cell.bodies[row])
     begin = point.copy()

@@ -1,5 +1,6 @@
 """The planner of the task level: the whole program as elemental moves, or the reason why it cannot
-be done."""
+be done.
+"""
 
 from __future__ import annotations
 
@@ -81,7 +82,8 @@ class TaskPlanner(Planner):
 
     def plan(self, tick: int) -> None:
         """Decompose the whole program into `output`, or refuse it; a lost plan is published
-        again."""
+        again.
+        """
         self._visible_at = tick + self._slice
         if self._plan is not None:
             self.output.copy_from(self._plan)
@@ -106,7 +108,8 @@ class TaskPlanner(Planner):
 
     def _is_on_its_way(self, tick: int, since: int) -> bool:
         """Return whether the executor may still report a plan: of this process, or of one before
-        it."""
+        it.
+        """
         if self._plan is not None:
             # Once visible, the status acknowledges it a cycle later.
             return tick <= self._visible_at + self.context.every
@@ -132,14 +135,16 @@ class TaskPlanner(Planner):
 
     def _visible_s(self, tick: int) -> float:
         """Return when the first moves of a plan begun at `tick` become visible below, s of
-        simulated time here."""
+        simulated time here.
+        """
         # It is ready within its cycles, is read and handed down at once, and is visible below a
         # cycle later.
         return (tick + (self.context.within_cycles + 1) * self.context.every) * self.context.tick_s
 
     def _with_times(self, moves: Sequence[Rehearsed]) -> list[Rehearsed]:
         """Set the time by which the last move of each action must be done below, for this level to
-        report in time."""
+        report in time.
+        """
         timed = list(moves)
         for k, (move, duration_s) in enumerate(moves):
             by_s = self._program.action[move.action].by
@@ -153,7 +158,8 @@ class TaskPlanner(Planner):
 
     def _promise(self, moves: Sequence[Rehearsed], visible_s: float) -> None:
         """Raise `Refused` with the earliest possible time if an action cannot be done by its
-        time."""
+        time.
+        """
         finish_s = finish_times(moves, visible_s, self.context, self._needs)
         for (move, _), finished_s in zip(moves, finish_s, strict=True):
             action = self._program.action[move.action]

@@ -1,5 +1,6 @@
 """The task in a config: the `[task]` table, a program of actions, and the parameters of the
-level."""
+level.
+"""
 
 from __future__ import annotations
 

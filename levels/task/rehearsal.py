@@ -1,5 +1,6 @@
 """Rehearsal of a program before anything moves: every move is planned as the level below will plan
-it, and timed."""
+it, and timed.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +29,8 @@ class Rehearsed(NamedTuple):
 @dataclass(frozen=True)
 class Rehearsal:
     """The result of a sequence of moves. Immutable: `then` returns a new one, so alternatives can
-    start from here."""
+    start from here.
+    """
 
     motion: MotionPlanner
     q: Array  # configuration at the end, (joints,), rad

@@ -98,7 +98,8 @@ class ShownWindow:
 
 def is_free(plan: TaskPlan, k: int) -> bool:
     """Return whether move `k` of the plan is a free motion; before the first and after the last
-    move, True."""
+    move, True.
+    """
     return not 0 <= k < plan.count or plan.moves["verb"][k] in FREE
 
 
@@ -121,7 +122,8 @@ class Detour:
     @property
     def is_known(self) -> bool:
         """False if this board was restarted and a hold came after the goto: the goal is then
-        lost."""
+        lost.
+        """
         return self._target is not None
 
     def reason(self) -> str:
@@ -132,7 +134,8 @@ class Detour:
 
     def begin(self, message: OperatorCommand, is_new: bool) -> None:
         """Accept a goto, an `OPERATOR_COMMAND`, or refuse it; one that is not new continues under
-        its id."""
+        its id.
+        """
         try:
             self._target = self._read(message)
         except ValueError as error:
@@ -143,7 +146,8 @@ class Detour:
 
     def step(self, plan: TaskPlan, done: int, below: MoveStatus) -> int:
         """Advance by one cycle; return how many of the plan's moves are done: `done`, or one
-        less."""
+        less.
+        """
         self.holds = False
         self.until = None
         standing = self._orders.standing
@@ -161,7 +165,8 @@ class Detour:
 
     def _leave(self, plan: TaskPlan, done: int, below: MoveStatus) -> int:
         """Interrupt the program where possible; until then show only the moves that must be done
-        first."""
+        first.
+        """
         self.until, self.holds = self._window.breaking_off(plan, done, below)
         if not self.holds:
             return done
@@ -175,7 +180,8 @@ class Detour:
 
     def as_move(self, action: int) -> Move:
         """Return the goto as a move; `action` is the program's next, though the move serves
-        none."""
+        none.
+        """
         assert self._target is not None, "there is a move only for a goal"
         verb, tool, joints = self._target
         return Move(self.move, action, verb, None, tool, joints, False, 0.0)
@@ -188,7 +194,8 @@ class Detour:
 
     def _read(self, message: OperatorCommand) -> tuple[Verb, Pose, Array]:
         """Return the kind of move to a goal, and its end. Raises `ValueError` for an invalid
-        one."""
+        one.
+        """
         joints = np.array(self._robot.home)
         tool = pose(np.zeros(3), (1.0, 0.0, 0.0, 0.0))
         goal = message.goal

@@ -31,7 +31,7 @@ def analyze(
     verbose: bool = option("--verbose", "add the tables of levels, tasks and equations", False),
     as_json: Json = False,
 ) -> None:
-    """Compare a run with the timing model: every equation that `rack check` predicts, with its
+    r"""Compare a run with the timing model: every equation that `rack check` predicts, with its
     measurement.
 
     Times of levels are processor time, without waiting and preemption. A virtual machine stalled by

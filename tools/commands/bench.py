@@ -54,7 +54,7 @@ def machine(
     share: Share = False,
     as_json: Json = False,
 ) -> None:
-    """Is this machine fit for real time, and up to which rate?
+    r"""Is this machine fit for real time, and up to which rate?
 
     The fastest board of a rack runs at each rate in turn; the other levels keep their rates. By
     turns with it, `cyclictest` of rt-tests sleeps to the same grid on the same core: no board can

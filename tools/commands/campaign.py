@@ -1,5 +1,6 @@
 """`rack campaign`: inject random faults of all kinds, and report detection, reaction and
-recovery."""
+recovery.
+"""
 
 from __future__ import annotations
 
@@ -62,7 +63,7 @@ def campaign(
     ),
     as_json: Json = False,
 ) -> None:
-    """Inject random faults of all kinds into runs of a rack, and judge each of them.
+    r"""Inject random faults of all kinds into runs of a rack, and judge each of them.
 
     Each trial has as many faults as fit. Trials in lockstep run on all cores at once, others one
     after the other. Until its first fault a trial is the faultless run: in lockstep it goes on from
@@ -140,7 +141,8 @@ def campaign(
 
 def _write(work: Campaign, results: Results, wall_s: float) -> tuple[dict[str, object], str]:
     """Write campaign.json, campaign.md and, unless interrupted or without matplotlib, campaign.png;
-    return the first two."""
+    return the first two.
+    """
     from rack.tools.faults.campaigns.report import CampaignReport
 
     work.folder.mkdir(parents=True, exist_ok=True)

@@ -1,5 +1,6 @@
 """`rack check`: validate a config, show its inventory, and predict whether its levels meet their
-cycles."""
+cycles.
+"""
 
 from __future__ import annotations
 
@@ -52,7 +53,7 @@ def check(
     ),
     as_json: Json = False,
 ) -> None:
-    """Validate a config, and predict whether its levels meet their cycles.
+    r"""Validate a config, and predict whether its levels meet their cycles.
 
     It prints every mistake, one per line; or five lines: does the rack fit, where is it tightest,
     how soon does it respond, what can its arm do at rest, and what to do. --verbose adds slots,
@@ -134,7 +135,8 @@ def check(
 
 def _measured(config: RackConfig, run: Path, percentile: float) -> RackConfig:
     """Return a config with the budgets measured in a run. Raises `Failure` for a run of another
-    rack."""
+    rack.
+    """
     # Only --from needs them, and they take long to load.
     from rack.tools.recording.cycles import measured_budgets
     from rack.tools.recording.recording import Recording

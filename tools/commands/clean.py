@@ -8,7 +8,7 @@ from rack.tools.console.parameters import Json
 
 
 def clean(as_json: Json = False) -> None:
-    """Remove the shared memory that killed racks left behind.
+    r"""Remove the shared memory that killed racks left behind.
 
     It never touches a rack in use, nor a directory or symbolic link that only has the name of one.
 

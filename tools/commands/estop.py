@@ -40,7 +40,7 @@ def estop(
     ),
     as_json: Json = False,
 ) -> None:
-    """Engage the brakes of the arm at once, and keep them engaged until --reset.
+    r"""Engage the brakes of the arm at once, and keep them engaged until --reset.
 
     The run continues with the arm braked. The reset is refused while a board is lost, or SYSFAIL or
     ACFAIL is asserted. On another machine's rack, HOST/RACK, those may set it whom its config names
@@ -83,7 +83,8 @@ def estop(
 
 def _stop_from_afar(address: RackAddress, reset: bool, ready: bool, operator: Operator) -> int:
     """Set the latch of a rack on another machine, at once or when Enter is pressed; return the tick
-    at which it was set. Raises `Failure`."""
+    at which it was set. Raises `Failure`.
+    """
     if reset:
         rack = address.rack
         why = f"resets an emergency stop on its own machine alone: rack estop {rack} --reset"
@@ -113,7 +114,8 @@ class _Teller:
 
 def _pressed(wait_s: float) -> bool:
     """Wait for a line on stdin, up to a time; say whether one has come. Raises `Failure` when none
-    can come any more."""
+    can come any more.
+    """
     if not readable(sys.stdin.fileno(), wait_s):
         return False
     if not sys.stdin.readline():

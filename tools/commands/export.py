@@ -18,7 +18,7 @@ def export(
     out: Path | None = option("--out FILE", "file to write; default: RUN/run.mcap"),
     as_json: Json = False,
 ) -> None:
-    """Write a recorded run as an MCAP file, which Foxglove and others read.
+    r"""Write a recorded run as an MCAP file, which Foxglove and others read.
 
     Each mailbox is a channel of JSON messages, whose schema has units and meanings; events are one,
     too. Log time is simulated time, publish time the wall clock. It needs mcap: pip install

@@ -41,7 +41,7 @@ def gantt(
     ),
     as_json: Json = False,
 ) -> None:
-    """Draw a Gantt chart of the schedule that follows from a config's budgets, or of the trace of a
+    r"""Draw a Gantt chart of the schedule that follows from a config's budgets, or of the trace of a
     run.
 
     The letters are unit functions: C reads the plan, R reads command and status, X executes, W

@@ -45,7 +45,7 @@ def inject(
     is_list: bool = option("--list", "list the kinds; with RACK, the faults of that rack", False),
     as_json: Json = False,
 ) -> None:
-    """Inject a fault into a running rack.
+    r"""Inject a fault into a running rack.
 
     It begins at the next tick and lasts to the end of the run, unless --tick, --when, --for or
     --cycles say otherwise. With --tick or --when, or on a rack that is held, the command arms the
@@ -111,7 +111,8 @@ def _values(parameters: list[str]) -> dict[str, str]:
 
 class KindsCommand(TyperCommand):
     """A command whose help ends with the kinds of faults, which are imported only when it is asked
-    for."""
+    for.
+    """
 
     def get_help(self, ctx: Any) -> str:
         """Return the help."""

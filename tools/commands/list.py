@@ -15,7 +15,7 @@ from rack.tools.console.tables import fitted
 
 
 def list_racks(as_json: Json = False) -> None:
-    """List the racks on this machine, running or left behind by a killed launcher.
+    r"""List the racks on this machine, running or left behind by a killed launcher.
 
     The states are starting, running and stopped; dead, if the launcher is gone; and foreign, if the
     shared memory is of another version or user. `rack clean` removes dead racks.
@@ -35,7 +35,8 @@ def list_racks(as_json: Json = False) -> None:
 
 def describe(name: str) -> Document:
     """Return the name, as "rack", the state and details of a rack; its age is in seconds. The
-    launcher's process id is None in another PID namespace."""
+    launcher's process id is None in another PID namespace.
+    """
     try:
         segment = Segment.attach(name)
     except SegmentError as error:

@@ -26,7 +26,7 @@ def mailbox(
     watch: bool = option("--watch", "show each message, until Ctrl-C or the end of the run", False),
     as_json: Json = False,
 ) -> None:
-    """Show the newest message in a mailbox of a running rack, field by field with units; or list
+    r"""Show the newest message in a mailbox of a running rack, field by field with units; or list
     the rack's mailboxes.
 
     Looking costs the boards nothing. With --watch and --json each message is one line.
@@ -61,7 +61,8 @@ def mailbox(
 
 def _watch(segment: Segment, ring: MailboxRing, text: MessageText, as_json: bool) -> None:
     """Show the newest message, and those that come until the run is over: all as JSON, for people
-    the newest of each look."""
+    the newest of each look.
+    """
     from rich.live import Live
     from rich.text import Text
 

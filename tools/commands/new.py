@@ -31,7 +31,7 @@ def new(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Write a folder with a class, a config that adds it to nasrem, and a test.
+    r"""Write a folder with a class, a config that adds it to nasrem, and a test.
 
     A level reads and writes messages, and has a live parameter and an event of its own. A servo
     law is one method: torques from set points and sensed motion. A planner works in the background

@@ -1,5 +1,6 @@
 """`rack pause` and `rack resume`: a rack in lockstep is held between two ticks; in real time its
-arm comes to rest on its path, and goes on from there."""
+arm comes to rest on its path, and goes on from there.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +14,7 @@ from rack.tools.monitor import pausing
 
 
 def pause(rack: RackName, as_json: Json = False) -> None:
-    """Pause a rack until 'rack resume'.
+    r"""Pause a rack until 'rack resume'.
 
     In lockstep it is held before its next tick, as by 'rack step'. In real time the clock goes on:
     the operator's hold of the highest level brings the arm to rest on its path. A level that does
@@ -37,7 +38,7 @@ def pause(rack: RackName, as_json: Json = False) -> None:
 
 
 def resume(rack: RackName, as_json: Json = False) -> None:
-    """Let a paused rack go on: the clock in lockstep, in real time the highest level that an
+    r"""Let a paused rack go on: the clock in lockstep, in real time the highest level that an
     operator holds.
 
     Exit status: 0 it goes on; 1 it is not paused, or there is no such rack.

@@ -33,7 +33,7 @@ def prompt(
         "SCRIPT", "Python script to run, in place of a prompt", None, dir_okay=False
     ),
 ) -> None:
-    """Open a Python prompt on the host side of a running rack, or run a script there.
+    r"""Open a Python prompt on the host side of a running rack, or run a script there.
 
     It takes the place of the program of a host board with `external = true`, one process at a time.
     `program` is the board's program, whose ports read and send messages; it may offer more names.
@@ -73,7 +73,8 @@ def prompt(
 
 def _wiring(segment: Segment, board: str | None) -> HostWiring:
     """Return the wiring of the external board. Raises `Failure` if there is none, or a choice of
-    several."""
+    several.
+    """
     found = {host.board: host for host in resolve(loads(segment.config)).hosts if host.is_external}
     names = ", ".join(found) or "none"
     if board is None and len(found) != 1:

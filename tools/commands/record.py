@@ -42,7 +42,7 @@ def record(
     ),
     as_json: Json = False,
 ) -> None:
-    """Record a running rack until its run is over, or until Ctrl-C.
+    r"""Record a running rack until its run is over, or until Ctrl-C.
 
     The recording begins with the two seconds that the rack's rings still hold. `rack report`, `rack
     analyze` and `rack replay` read it. Recording costs the rack no deadline, and ending it does not
@@ -111,7 +111,8 @@ def _saved(segment: Segment, folder: Path) -> tuple[Document, str]:
 
 def save_run(folder: Path, into: Path) -> None:
     """Make a run's folder, `into`, of what the recorder of `folder` has taken so far; that one goes
-    on."""
+    on.
+    """
     stretches = (f"{STRETCHES}/{path.name}" for path in stretch_files(folder))
     for name in (CONFIG, PUBLISHED, ORIGIN, CODE, EVENTS, CHECKSUMS, SPOOL, *stretches):
         (into / name).parent.mkdir(parents=True, exist_ok=True)
@@ -139,7 +140,8 @@ def _begin(segment: Segment, folder: Path, port: int | None) -> RecorderProcess:
 
 def _record(racks: Sequence[Segment], folder: Path, view: bool) -> list[str]:
     """Record a rack into a folder; or each of several into its own, then all of them into one
-    file. Return messages for the user."""
+    file. Return messages for the user.
+    """
     names = [rack.layout.rack for rack in racks]
     if twice := [name for at, name in enumerate(names) if name in names[:at]]:
         raise Failure(f"--with {twice[0]}: this rack is to be recorded already", 2)

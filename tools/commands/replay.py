@@ -34,7 +34,7 @@ def replay(
         "another run of the same rack, or 'origin', the one that RUN continues: both, tick by tick",
     ),
 ) -> None:
-    """Open the recording of a run in the viewer; return when it is closed.
+    r"""Open the recording of a run in the viewer; return when it is closed.
 
     It shows the arm in 3D, its curves, a Gantt lane for each task, and the log. RUN may also be a
     run.rrd.
@@ -84,7 +84,8 @@ def replay(
 
 def _own(run: Path) -> list[Path]:
     """Return the viewer's files of a run: a long one has several, as has a restarted recorder.
-    Raises `Failure` for a damaged one."""
+    Raises `Failure` for a damaged one.
+    """
     is_file = run.suffix == ".rrd"
     checksums = Checksums(run.parent if is_file else run)
     found = [run] if is_file and run.is_file() else parts_of(run / FILE)

@@ -29,7 +29,7 @@ def report(
     ),
     as_json: Json = False,
 ) -> None:
-    """Report on a run, from its recording.
+    r"""Report on a run, from its recording.
 
     It writes report.json and report.md, unless those of the run are newer than its recording and
     this program. On a terminal the tables show as many columns as fit; report.md has all.

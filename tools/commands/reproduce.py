@@ -1,5 +1,6 @@
 """`rack reproduce`: the paper, section by section, next to predictions and measurements of this
-machine."""
+machine.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +35,7 @@ def reproduce(
     ),
     as_json: Json = False,
 ) -> None:
-    """Reproduce the paper on this machine, and write a page that goes through it claim by claim.
+    r"""Reproduce the paper on this machine, and write a page that goes through it claim by claim.
 
     The paper is NISTIR 90-4251 (1990). Each claim, equation and figure is given in its words, with
     what the timing model predicts of it, what real processes have shown, and a ruling: it holds; it

@@ -36,7 +36,7 @@ MOST_S = 1e9
 
 
 def rewind(run: RunFolder, anyway: Anyway = False, as_json: Json = False) -> None:
-    """Go back to any tick of a recorded run, see what was in force there and what the levels held
+    r"""Go back to any tick of a recorded run, see what was in force there and what the levels held
     in their own objects, and branch off.
 
     It opens a prompt; commands may come from stdin, too, one a line. With --json each answer is a

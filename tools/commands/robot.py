@@ -47,7 +47,7 @@ def new(
     out: Path | None = option("--out DIR", "new folder; default: NAME"),
     as_json: Json = False,
 ) -> None:
-    """Write a folder with a config, a scene and a task for the arm of a model file.
+    r"""Write a folder with a config, a scene and a task for the arm of a model file.
 
     What the model states is taken: the joints along the chain, their limits, torques of actuators
     or of a URDF's efforts, a keyframe. The rest is found (the tool, a home free of contact, the
@@ -90,7 +90,7 @@ def check(
     out: Path | None = option("--out PNG", "file of the picture; default: NAME.png"),
     as_json: Json = False,
 ) -> None:
-    """Examine an arm before it moves, and draw it: everything at once.
+    r"""Examine an arm before it moves, and draw it: everything at once.
 
     Of a config its arm, of a model file the arm that `rack robot new` would make of it: axes,
     limits, reach, payload at the edge of its reach, contacts at home, bodies that nothing holds,
@@ -176,7 +176,8 @@ def _completed(source: Source, wanted: Wishes) -> Wishes:
 @contextmanager
 def drafting(model: Path) -> Iterator[Path]:
     """Provide a temporary folder; errors name the user's model in place of files in it. Raises
-    `Failure`."""
+    `Failure`.
+    """
     with TemporaryDirectory() as folder:
         try:
             yield Path(folder)
@@ -197,7 +198,8 @@ def _numbers(text: str, option: str) -> tuple[float, ...]:
 
 def _made(model: Path, wanted: Wishes, folder: Path, name: str, asks: bool) -> Document:
     """Write the folder of an arm, asking for more if `asks`; return what it is. Raises
-    `RobotError`."""
+    `RobotError`.
+    """
     from rack.tools.robot.assignment import lay_out
     from rack.tools.robot.draft import draft
     from rack.tools.robot.folder import config_text, document

@@ -77,7 +77,7 @@ def run(
     ),
     as_json: Json = False,
 ) -> None:
-    """Run a rack until its task ends, and report on the run.
+    r"""Run a rack until its task ends, and report on the run.
 
     A rack that names others in adapter.lan.launch launches them, too, each in a process of its own;
     one that fails ends all. On a terminal a live table shows every task and what holds the rack;
@@ -163,7 +163,8 @@ def run(
 
 def _informed(crate: CrateLine | None, tables: Tables) -> CrateLine | None:
     """Let the crate load the levels that a config names, while this process imports what checks the
-    config."""
+    config.
+    """
     if crate is not None:
         own = tables.get("python_path")
         crate.send(
@@ -176,7 +177,8 @@ def _informed(crate: CrateLine | None, tables: Tables) -> CrateLine | None:
 
 def _report(config: RackConfig, folder: Path | None, result: RunResult, as_json: bool) -> Document:
     """Make the report, print it and return it. A run that has no report where one is wanted has
-    failed."""
+    failed.
+    """
     from rack.tools.recording.folder_size import recorded_line
     from rack.tools.report.report import unrecorded, write_report
     from rack.tools.report.report_markdown import summary

@@ -29,7 +29,7 @@ def schema(
     ),
     as_json: Json = False,
 ) -> None:
-    """Show the keys of a config: type, unit, permitted values, default and meaning.
+    r"""Show the keys of a config: type, unit, permitted values, default and meaning.
 
     Without TABLE it lists the tables. The levels' own tables, [task] and [board.<name>.params], are
     those of the boards in CONFIG. A part of a name shows all tables that begin with it.

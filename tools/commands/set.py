@@ -18,7 +18,7 @@ def set_param(
     at: At = None,
     as_json: Json = False,
 ) -> None:
-    """Set a live parameter of a running rack, between two cycles of its level.
+    r"""Set a live parameter of a running rack, between two cycles of its level.
 
     'rack schema' marks those that a level declares as live; all others are read at the launch
     alone. This is an operator's command: the level sets it again when its board is restarted, and a

@@ -31,7 +31,7 @@ OnlyRack = Annotated[
 
 
 def status(rack: OnlyRack = None, as_json: Json = False) -> None:
-    """Show a running rack once: every task, its faults, what holds it, and its progress.
+    r"""Show a running rack once: every task, its faults, what holds it, and its progress.
 
     Each task has a line with its cycles, misses, longest times and state. A hold is shown with its
     time, its reason, and the command that releases it.
@@ -68,7 +68,8 @@ def only_rack() -> str:
 
 def recorded_by(segment: Segment) -> Path | None:
     """Return the folder into which a rack is recorded; None if it is not, or if that cannot be
-    seen from this PID namespace."""
+    seen from this PID namespace.
+    """
     if not segment.launcher:
         return None
     pid = segment.words[System.FOLLOWER_PID]

@@ -1,5 +1,6 @@
 """`rack step`: let a rack in lockstep go on by single ticks or cycles, and show what its levels
-did."""
+did.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +25,7 @@ def step(
     run: bool = option("--run", "let the rack run on without steps", False),
     as_json: Json = False,
 ) -> None:
-    """Let a rack in lockstep go on by single cycles, and show each level's state, and the row of
+    r"""Let a rack in lockstep go on by single cycles, and show each level's state, and the row of
     its state table.
 
     Start the rack with 'rack run CONFIG --lockstep --step': it holds before tick 0. A rack that

@@ -15,7 +15,7 @@ LOOK_S = 0.2
 
 
 def top(rack: OnlyRack = None) -> None:
-    """Watch a running rack until its run is over, or until Ctrl-C.
+    r"""Watch a running rack until its run is over, or until Ctrl-C.
 
     On a terminal it fills the screen, if textual is there (pip install 'nasrem-rack[live]'), and
     keys command the rack. Elsewhere one line a second is printed. Watching costs the rack no

@@ -41,7 +41,7 @@ def watch(
     ),
     as_json: Json = False,
 ) -> None:
-    """Show signals of a running rack until its run is over, or until Ctrl-C.
+    r"""Show signals of a running rack until its run is over, or until Ctrl-C.
 
     A signal is a field of a mailbox ('rack mailbox RACK' lists those), or one number of it. On a
     terminal it is plotted, if plotext is there (pip install 'nasrem-rack[live]'). Otherwise each
@@ -132,7 +132,8 @@ def _show(segment: Segment, signals: Sequence[Signal], every_s: float, as_json: 
 
 def _await_moment(segment: Segment, strip: Strip, trigger: Trigger, after: int) -> int:
     """Return the tick at which a condition first holds, once the `after` ticks behind it are there.
-    Raises `Failure` when the run ends before."""
+    Raises `Failure` when the run ends before.
+    """
     tick = -1
     for _ in looks(segment, LOOK_S):
         for written in strip.take():

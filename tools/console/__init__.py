@@ -1,2 +1,3 @@
 """Shared by all commands: arguments, answers, tables, progress, signals. Nothing here knows of
-runs."""
+runs.
+"""

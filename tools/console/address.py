@@ -16,7 +16,8 @@ _ADDRESS = re.compile(rf"(\[[0-9a-fA-F:.]+\]|[A-Za-z0-9._-]+)(?::([0-9]{{1,5}}))
 
 class Operator(NamedTuple):
     """Who sets an emergency stop: a name as in `adapter.lan.estop_from`, and the folder with its
-    certificates; empty: none."""
+    certificates; empty: none.
+    """
 
     name: str = OPERATOR
     certificates: str = ""
@@ -37,7 +38,8 @@ class Operator(NamedTuple):
 
 class RackAddress(NamedTuple):
     """A rack on another machine: the host and port at which it listens, and its name. An IPv6
-    address has its brackets."""
+    address has its brackets.
+    """
 
     host: str
     port: int

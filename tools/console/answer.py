@@ -62,7 +62,8 @@ def print_answer(document: Any, text: str | Iterable[str], as_json: bool) -> Non
 
 def fail(reason: str, status: int) -> NoReturn:
     """End the command: print the reason on stderr and, with --json, as a JSON document on
-    stdout."""
+    stdout.
+    """
     lines = [
         line if line.isprintable() and len(line) <= MAX_LINE else one_line(line, MAX_LINE)
         for line in reason.splitlines()

@@ -53,7 +53,8 @@ class Interrupt:
 
     def catch(self) -> None:
         """Handle the signals. Until then they kill the process, with the same exit status for a
-        shell."""
+        shell.
+        """
         for number in SIGNALS:
             # Under nohup a command outlives its terminal.
             if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
@@ -84,12 +85,14 @@ class Interrupt:
 
     def raising(self) -> AbstractContextManager[None]:
         """In this context the first signal raises `Interrupted`: for waits, and where contexts
-        clean up files."""
+        clean up files.
+        """
         return self.orderly(_interrupted)
 
     def settle(self) -> None:
         """End the process with the signal's exit status, if one was received. Call it when the
-        command has finished."""
+        command has finished.
+        """
         if self.number:
             for stream in (sys.stdout, sys.stderr):
                 with suppress(OSError, ValueError):
@@ -131,7 +134,8 @@ INTERRUPT = Interrupt()
 
 def _cleans_up(pid: int) -> bool:
     """Say whether a process is Python's own that removes the semaphores of a pool of processes: it
-    does so, and ends, when this process has ended."""
+    does so, and ends, when this process has ended.
+    """
     with suppress(OSError):
         return b"multiprocessing.resource_tracker" in Path(f"/proc/{pid}/cmdline").read_bytes()
     return False
@@ -153,7 +157,8 @@ def _leave_terminal() -> None:
 
 def _kill(family: list[int]) -> None:
     """Kill every descendant in this session and wait for it; a viewer window has its own session
-    and stays."""
+    and stays.
+    """
     for pid in family:
         with suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
@@ -174,7 +179,8 @@ def await_ends(pids: Iterable[int], bound_s: float) -> None:
 
 def descendants(pid: int, session: int | None = None) -> Iterator[int]:
     """Yield the processes that descend from one, the youngest generation first; with a `session`,
-    only those in it."""
+    only those in it.
+    """
     # A process that ends meanwhile leaves nothing to read.
     children: list[int] = []
     with suppress(OSError):

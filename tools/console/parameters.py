@@ -59,7 +59,8 @@ def named(rack: str | None) -> str | None:
 
 def named_here(rack: str | None) -> str | None:
     """Return the name of a rack on this machine. Raises `Failure` for one on another, where this
-    command is needed."""
+    command is needed.
+    """
     if rack is not None and "/" in rack:
         raise Failure(
             f"RACK = {rack}: this command works on the rack's own machine alone, as in: ssh HOST"

@@ -1,5 +1,6 @@
 """Pictures by matplotlib, as PNG and SVG. It is an extra, and takes a second to import: only what
-draws may import it, after `can_draw`."""
+draws may import it, after `can_draw`.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +28,8 @@ def picture(
     paths: Sequence[Path], width_in: float, height_in: float, **settings: Any
 ) -> Iterator[Figure]:
     """Give an empty figure to draw on, and save it when the context ends; equal figures make equal
-    files."""
+    files.
+    """
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 

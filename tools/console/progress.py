@@ -39,7 +39,8 @@ class Progress:
 
     def end(self, seconds: float, ended: str = "done", shortfalls: Sequence[str] = ()) -> None:
         """Advance by the expected `seconds` of a run; show how it ended, on a terminal only its
-        shortfalls."""
+        shortfalls.
+        """
         self._bar.update(self._task, advance=seconds)
         if not self._bar.disable:
             for line in shortfalls:
@@ -71,7 +72,8 @@ def progress_for(silent: bool) -> Iterator[Progress]:
 
 def reading_progress(silent: bool, what: str = "reading the run") -> Callable[[float], None]:
     """Return a function that takes the part of the work that is done, 0 to 1, and prints it on
-    stderr now and then."""
+    stderr now and then.
+    """
     shown = time.monotonic()
 
     def show(part: float) -> None:

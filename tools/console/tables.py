@@ -1,5 +1,6 @@
 """Tables and their cells as text: they fit the terminal; in a pipe, and as Markdown, nothing is cut
-or coloured."""
+or coloured.
+"""
 
 from __future__ import annotations
 
@@ -58,7 +59,8 @@ def fitted_records(
     records: Sequence[Mapping[str, object]], dropped: Sequence[str] = ()
 ) -> Iterator[str]:
     """Yield the lines of such a table, with a row for each record, at least one, and a column for
-    each key."""
+    each key.
+    """
     return fitted([*records[0]], [[*map(str, one.values())] for one in records], dropped)
 
 
@@ -70,7 +72,8 @@ def grid(
     style: Callable[[str, str], str] = lambda column, text: "",
 ) -> Table:
     """Return the same table for rich to draw; `style` gives the style of a cell by its column and
-    text."""
+    text.
+    """
     columns = list(zip(head, *rows, strict=True))
     for name in dropped:
         if sum(max(map(len, column)) for column in columns) + GAP * (len(columns) - 1) <= width:
@@ -113,7 +116,8 @@ Cell = str | float | None
 @dataclass(frozen=True)
 class TextTable:
     """A table as data: of each row the cells by column. `dropped` are columns that a narrow
-    terminal leaves out, the first of them first."""
+    terminal leaves out, the first of them first.
+    """
 
     records: Sequence[Mapping[str, Cell]]
     dropped: Sequence[str] = ()

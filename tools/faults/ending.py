@@ -1,5 +1,6 @@
 """The state of a rack at its end, before its memory is released: its faults, its levels, its
-arm."""
+arm.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +28,8 @@ AT_REST = 0.02
 
 def record_of(kind: str) -> Kind:
     """Return the record of a kind in reports; a kill from outside is like any other. Raises
-    `Failure` for an unknown kind."""
+    `Failure` for an unknown kind.
+    """
     name = "kill" if kind == EXTERNAL else kind
     if name not in KINDS:
         why = "no level that is imported here adds it, and the run has no published.json that does"
@@ -79,7 +81,8 @@ class Strike:
 @dataclass(frozen=True)
 class ArmEnd:
     """An arm at the end of a run: limits violated and touches, counted at every substep; whether it
-    is at rest."""
+    is at rest.
+    """
 
     violations: int = 0
     touches: int = 0
@@ -96,7 +99,8 @@ def strikes(segment: Segment, joints: Sequence[str]) -> tuple[Strike, ...]:
 
 def arm_of(segment: Segment) -> ArmEnd:
     """Return the arm of a rack as its state and its levels last told; a rack without one violates
-    no limit."""
+    no limit.
+    """
     seen = [status for _, status in statuses(segment, "violations")]
     counted = [*seen, *(state for _, state in arm_states(segment))]
     return ArmEnd(

@@ -1,5 +1,6 @@
 """Events as evidence of faults: which event can be the detection of which fault, and the reactions
-to it."""
+to it.
+"""
 
 from __future__ import annotations
 
@@ -90,7 +91,8 @@ def fits(event: Event, strike: Strike) -> bool:
 
 def explains(strike: Strike, event: Event) -> bool:
     """Return whether an event in a fault's time can come of it: as its detection, or as a
-    consequence of its kind."""
+    consequence of its kind.
+    """
     follows = strike.record.consequence
     if event.kind == "miss":
         # A fault that takes one task's cycles may take those of any task on its core.
@@ -104,7 +106,8 @@ def explains(strike: Strike, event: Event) -> bool:
 
 def is_about(event: Event, strike: Strike) -> bool:
     """Return whether an event is about the target of a fault: its mailboxes, its task, its
-    joint."""
+    joint.
+    """
     if event.code == DIED:
         return event.board == strike.board
     if event.code in MAILBOX_ALARMS:
@@ -126,7 +129,8 @@ class SkippedTicks:
 
     def between(self, first: int, last: int) -> int:
         """Return how many ticks after `first`, up to `last`, did not happen: as many as any one
-        task has missed."""
+        task has missed.
+        """
         by_task = Counter[str]()
         for event in self._skips:
             if first < event.tick <= last:
@@ -200,7 +204,8 @@ def _can_react(strike: Strike, reaction: Event) -> bool:
 
 def takes_cycles(strike: Strike) -> bool:
     """Return whether a fault keeps tasks from their cycles, so that these are missed because of
-    it."""
+    it.
+    """
     return strike.record.where in TAKE_CYCLES
 
 

@@ -1,5 +1,6 @@
 """The judge of faults: did each strike, was it found within its bound, reacted to, and recovered
-from?"""
+from?
+"""
 
 from __future__ import annotations
 
@@ -74,7 +75,8 @@ class Judgement:
     @property
     def part_of_bound(self) -> float | None:
         """The delay as a part of its bound, in time where time is bounded; None without a bound, or
-        with bound 0."""
+        with bound 0.
+        """
         if self.bound_ms is not None and self.delay_ms is not None:
             return self.delay_ms / self.bound_ms
         return self.delay / self.bound if self.bound and self.delay is not None else None
@@ -202,7 +204,8 @@ class Judge:
 
     def _is_periodic(self, mailbox: str) -> bool:
         """Return whether a mailbox has a message in every period: no plan, queue or news has, nor a
-        host board's."""
+        host board's.
+        """
         box = self._layout.mailbox(mailbox)
         return (
             self._layout.task(box.writer).role == "executor"
@@ -212,7 +215,8 @@ class Judge:
 
     def _is_of_any(self, late: Detection, later: Sequence[Strike]) -> bool:
         """Return whether a detection, too late for one fault, is in time for one of those that
-        struck after it."""
+        struck after it.
+        """
         return not late.is_within and any(
             fits(late.event, strike) and self._detection(late.event, strike).is_within
             for strike in later
@@ -220,7 +224,8 @@ class Judge:
 
     def _is_brief(self, strike: Strike) -> bool:
         """Return whether a fault of the arm never showed, or in fewer cycles than it may take to be
-        found."""
+        found.
+        """
         if strike.record.where != "arm":
             return False
         until = strike.hidden + strike.count * cycle_ticks(self._layout, strike.board)
@@ -307,7 +312,8 @@ class Judge:
 
     def _is_met(self, event: Event) -> bool:
         """Return whether an obstacle has hit an arm that a fault has stopped, or that waits for
-        another path since."""
+        another path since.
+        """
         is_moving = event.code == COLLISION and any(
             f"'{name}'" in event.text for name in self._run.moving
         )
@@ -322,7 +328,8 @@ def end_of(strike: Strike) -> int:
 
 def faults(recorded: Sequence[Mapping[str, Any]], layout: Layout) -> Report:
     """Return every fault injected into a run, detections that none explains, and restarts by task,
-    by its events."""
+    by its events.
+    """
     events = [Event(**event) for event in recorded if "tick" in event]
     ended: Mapping[str, Any] = next((event for event in recorded if event["kind"] == "outcome"), {})
     strikes = TypeAdapter(tuple[Strike, ...]).validate_python(ended.get("faults", ()))

@@ -78,7 +78,8 @@ class LiveRack:
 
     def withdraw(self, number: int) -> Document:
         """Withdraw a fault that waits for its tick or condition; return it as plain data. Raises
-        `Failure`."""
+        `Failure`.
+        """
         waiting = {entry.index: entry for entry in self._table.staged((Stage.WAITING,))}
         if number not in waiting:
             known = ", ".join(map(str, waiting)) or "none"
@@ -126,7 +127,8 @@ class LiveRack:
 
     def _check(self, fault: FaultConfig) -> None:
         """Refuse a fault that a running rack, or this process, cannot have. Raises `ConfigError`,
-        `Failure`."""
+        `Failure`.
+        """
         tick = self._segment.words[System.TICK]
         where = KINDS[fault.kind].where
         if where == "start":
@@ -159,7 +161,8 @@ class LiveRack:
 
     def _await_end(self, entry: FaultEntry, timeout_s: float | None) -> None:
         """Wait until a fault, or the run, is over. Raises `Failure` after `timeout_s`, or when it
-        never began."""
+        never began.
+        """
         self._print_waiting(entry)
         if not self._wait_until(lambda: entry.stage == Stage.OVER, timeout_s):
             raise Failure(f"timed out after {timeout_s:g} s: {self._state(entry)}")

@@ -1,5 +1,6 @@
 """The `rack` command. This module stands outside the package `rack`, so that it can tell when
-another distribution's package of that name is imported in its place."""
+another distribution's package of that name is imported in its place.
+"""
 
 from __future__ import annotations
 

@@ -101,7 +101,8 @@ class RunAgain:
 
     def reach(self, tick: int) -> None:
         """Have a snapshot before `tick`, in which all is as it was in the run then; note on stderr
-        what is not. Raises `Failure`."""
+        what is not. Raises `Failure`.
+        """
         if not self._has_begun and self._branched_at not in (None, tick):
             # From here on all snapshots are of this run, not of the one that it continues.
             self.reach(self._branched_at or 0)
@@ -193,7 +194,8 @@ class RunAgain:
 
     def _first_unlike(self, folder: Path, tick: int) -> str:
         """Return the first message that differs until `tick`, as text, from a record of the rack
-        that runs again into `folder`."""
+        that runs again into `folder`.
+        """
         config = self._own_config("again")
         begins = self._begin(self._branched_at or 0)
         run_rack(config, tick * config.clock_ns * 1e-9, folder, Display(), begins=begins)
@@ -226,7 +228,8 @@ def beginning(
     config: RackConfig, origin: str, crate: WarmCrate | None = None, anyway: bool = False
 ) -> Iterator[Beginning]:
     """Yield what a rack with this config, a branch perhaps, goes on from at RUN@TIME, for as long
-    as it runs. A `crate` that was started earlier saves time. Raises `Failure`."""
+    as it runs. A `crate` that was started earlier saves time. Raises `Failure`.
+    """
     recording = Recording(run_of(origin).parent)
     asked = f"--from {origin}"
     tick = tick_in(recording, origin.rpartition("@")[2], f"{asked}: ")
@@ -245,7 +248,8 @@ def beginning(
 
 def tick_in(recording: Recording, text: str, asked: str = "") -> int:
     """Return the tick of a time, s, in a recorded run. Raises `Failure`, which begins with what was
-    `asked`, for one outside, or between two stretches that were kept."""
+    `asked`, for one outside, or between two stretches that were kept.
+    """
     tick = -1
     # What is no time is outside, too.
     with suppress(ValueError, OverflowError):

@@ -1,5 +1,6 @@
 """A run's folder, and the event log in it: events.jsonl, one JSON object a line, the outcome
-last."""
+last.
+"""
 
 from __future__ import annotations
 
@@ -64,7 +65,8 @@ class EventLog:
 
     def end(self, outcome: Document) -> None:
         """Write the outcome, close the file, and put its events in order: until now they are as
-        they became known."""
+        they became known.
+        """
         self._write({"time_ns": time.time_ns(), "kind": "outcome", **outcome})
         self.close()
         if self._file is not self._earlier and not self.has_failed:

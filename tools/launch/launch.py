@@ -58,7 +58,8 @@ News = Callable[[], list[str]]
 class Beginning:
     """What a run goes on from: a snapshot in a crate, which without one is just started earlier;
     the commands that its operators gave; what its host boards and other racks sent, which are not
-    started then; and which run that is, for the record."""
+    started then; and which run that is, for the record.
+    """
 
     continues: Continuation | None = None
     crate: CrateLine | None = None
@@ -97,7 +98,8 @@ class RunResult:
     @property
     def worked(self) -> bool:
         """Whether the run succeeded as far as its end shows it: only a report judges its system
-        response."""
+        response.
+        """
         return not self.failure()
 
     def failure(self) -> str:
@@ -195,7 +197,8 @@ def begin_folder(
     folder: Path, config: RackConfig, log: EventLog, origin: Origin | None = None
 ) -> None:
     """Write what is known when a run begins into its folder: config, code, the events so far.
-    Raises `Failure`."""
+    Raises `Failure`.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "config.toml").write_text(config.text())
@@ -240,7 +243,8 @@ def result_of(
 
 def _open_viewer(port: int) -> News:
     """Open the viewer on what the recorder serves; return its news. Without a viewer the rack runs
-    all the same."""
+    all the same.
+    """
     window = import_module(VIEWER)
     try:
         opened: News = window.ViewerWindow(window.url(port)).news

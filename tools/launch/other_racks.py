@@ -1,5 +1,6 @@
 """The racks that `adapter.lan.launch` names: a run launches them with its own, each by `rack run`
-in a process of its own."""
+in a process of its own.
+"""
 
 from __future__ import annotations
 

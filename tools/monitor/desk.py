@@ -1,5 +1,6 @@
 """The operator's desk of a running rack, from the host side: gives a command to a level and waits
-for its reply."""
+for its reply.
+"""
 
 from __future__ import annotations
 
@@ -63,7 +64,8 @@ class LiveDesk:
 
     def highest(self, *in_force: str) -> list[str]:
         """Return the levels that take a hold and have one of these commands in force ("": none),
-        without those below another one of them."""
+        without those below another one of them.
+        """
         found = [
             name
             for name in self._levels
@@ -183,7 +185,8 @@ class LiveDesk:
 
     def _looks(self, about: str, awaited: str) -> Iterator[bool]:
         """Yield again and again whether the run is over, for as long as the clock ticks or the rack
-        is held; explain a long wait on stderr, once."""
+        is held; explain a long wait on stderr, once.
+        """
         words = self._segment.words
         tick = words[System.TICK]
         changed = time.monotonic()

@@ -153,7 +153,8 @@ def display_for(silent: bool) -> Iterator[Display]:
 @dataclass(frozen=True)
 class RackView:
     """A snapshot, for rich to draw: head line, tasks, rows of tables, complaints, queues, faults,
-    holds, progress."""
+    holds, progress.
+    """
 
     snapshot: Snapshot
 
@@ -197,7 +198,8 @@ def _cell(column: str, value: Any) -> str:
 
 def line_of(snapshot: Snapshot) -> str:
     """Return the rack as one short line, for where there is no terminal: what holds it and its
-    faults are counted."""
+    faults are counted.
+    """
     counts = {
         "missed": sum(row.missed for row in snapshot.tasks),
         "skipped": sum(row.skipped for row in snapshot.tasks),

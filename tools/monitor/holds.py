@@ -1,5 +1,6 @@
 """Holds: which level of a rack is kept from its work, since when, why, and the command that
-releases it."""
+releases it.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +35,8 @@ OPERATED = frozenset({"standing", "order", "answer"})
 @dataclass(frozen=True)
 class Hold:
     """One level, or the arm, kept from its own work. The command `release` ends it; empty: it ends
-    by itself."""
+    by itself.
+    """
 
     level: str
     since_tick: int
@@ -56,7 +58,8 @@ def resume_command(rack: str, level: str) -> str:
 
 def is_news(reason: str, shown: list[str]) -> bool:
     """Return whether a reason is not yet among those `shown`, and add it: levels repeat reasons of
-    the level below."""
+    the level below.
+    """
     origin = PASSED_ON.split(reason)[-1][:SAME]
     if any(origin in other for other in shown):
         return False
@@ -106,7 +109,8 @@ def _find_holds(newest: Newest) -> Iterator[Hold]:
 
 def _command_in_force(segment: Segment, level: str, status: AnyMessage) -> tuple[int, int, str]:
     """Return tick, serial and text of the operator's command in force at a level; serial 0 where
-    its message is gone."""
+    its message is gone.
+    """
     rows = MailboxRing(segment, f"{level}.operator").drain().rows
     given = rows["message"]
     is_candidate = (given["what"] == status.standing) & (given["id"] <= answered(status))
@@ -125,7 +129,8 @@ def _command_in_force(segment: Segment, level: str, status: AnyMessage) -> tuple
 
 class Standstill:
     """Reports, once, a hold under which nothing has moved for a while: the run will not continue by
-    itself."""
+    itself.
+    """
 
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
@@ -135,7 +140,8 @@ class Standstill:
 
     def look(self) -> Iterator[Event]:
         """Yield an event for each hold that somebody must end and that has not been reported
-        yet."""
+        yet.
+        """
         # Here, not above: it needs the kinds of faults, for which `rack status` should not wait.
         from rack.tools.faults.ending import arm_of
 

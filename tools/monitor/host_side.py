@@ -35,7 +35,8 @@ class HostRow:
 @dataclass(frozen=True)
 class EntryRow:
     """One entry of a bus adapter: its counts, and the age of its newest message, simulated ms;
-    None: none yet."""
+    None: none yet.
+    """
 
     entry: str
     source: str
@@ -65,7 +66,8 @@ def host_rows(segment: Segment) -> tuple[HostRow, ...]:
 
 def restarts(segment: Segment, writer: str) -> int:
     """Return how often a new process took over the mailboxes of a task or host board: each writes
-    in a new epoch."""
+    in a new epoch.
+    """
     return max([0, *(head[Box.EPOCH] - 1 for head in _heads(segment, writer))])
 
 
@@ -92,7 +94,8 @@ def entry_rows(newest: Newest) -> tuple[EntryRow, ...]:
 
 def entries_of(layout: Layout, config: str) -> Iterator[tuple[str, str, str]]:
     """Yield status mailbox, name and source of every entry of a rack's bus adapters; `config` is
-    TOML text."""
+    TOML text.
+    """
     boxes = [box.name for box in layout.mailboxes if box.message == ADAPTER_STATUS]
     boards = load_toml(config)["board"] if boxes else {}
     for box in boxes:

@@ -1,5 +1,6 @@
 """What interrupted the boards of a rack, under protocol interrupt: now, and message by message in a
-run."""
+run.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +27,8 @@ LOST = np.iinfo(np.int64).max
 @dataclass(frozen=True)
 class InboxFill:
     """The inbox of a board, so far: messages `served` and `lost`, and the most that waited, of at
-    most `depth`."""
+    most `depth`.
+    """
 
     board: str
     served: int
@@ -64,7 +66,8 @@ def inbox_fills(segment: Segment) -> tuple[InboxFill, ...]:
 
 class Arrivals(NamedTuple):
     """The messages that interrupted a board, mailbox after mailbox; times in ns of simulated time
-    since tick 0. Arrays have shape (n,)."""
+    since tick 0. Arrays have shape (n,).
+    """
 
     mailbox: np.ndarray  # number of the mailbox, as `Layout.interrupting` counts
     sent_ns: np.ndarray
@@ -74,7 +77,8 @@ class Arrivals(NamedTuple):
 
 def replay_inbox(recording: Recording, slot: int) -> Arrivals:
     """Work the inbox of the board in a slot out again from the messages of a run, as the board
-    did."""
+    did.
+    """
     layout = recording.layout
     boxes = layout.interrupting(slot)
     sent = []

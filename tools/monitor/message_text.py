@@ -1,5 +1,6 @@
 """The mailboxes of a rack as rows, and a message as a document, and as lines for people, field by
-field with units."""
+field with units.
+"""
 
 from __future__ import annotations
 

@@ -30,7 +30,8 @@ COUNTS = (
 @dataclass(frozen=True)
 class PeerRow:
     """Another rack now. `clock_ms` is its clock less ours, within `within_ms`, ms; None: not known,
-    or in lockstep."""
+    or in lockstep.
+    """
 
     peer: str
     state: str
@@ -44,7 +45,8 @@ class PeerRow:
 @dataclass(frozen=True)
 class ImportRow:
     """One import now: its counts, and the age of its information in ticks here and in s of
-    simulated time."""
+    simulated time.
+    """
 
     entry: str
     source: str
@@ -71,7 +73,8 @@ class ExportRow:
 
 class Entries(NamedTuple):
     """What a rack exchanges: the source of each export and import by port, and the racks with which
-    it works."""
+    it works.
+    """
 
     exports: dict[str, str]
     imports: dict[str, str]

@@ -1,5 +1,6 @@
 """A rack that is paused, and goes on: in lockstep between two ticks, by single ticks or cycles as
-well; in real time by the operator's hold."""
+well; in real time by the operator's hold.
+"""
 
 from __future__ import annotations
 
@@ -126,7 +127,8 @@ def pause(segment: Segment) -> Pause:
 
 def resume(segment: Segment) -> list[str]:
     """Let a paused rack go on; return the levels that were held. Raises `Failure` when it is not
-    paused."""
+    paused.
+    """
     words = segment.words
     levels: list[str] = []
     if words[System.LOCKSTEP]:

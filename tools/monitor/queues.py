@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 @dataclass(frozen=True)
 class QueueFill:
     """A queue now: `unread` messages, of at most `capacity`, and how many were refused so far
-    because it was full."""
+    because it was full.
+    """
 
     mailbox: str
     unread: int

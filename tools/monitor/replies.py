@@ -131,7 +131,8 @@ class Replies:
 
 class LastCycle:
     """Knows when a level should have answered: by the cycles that it did, not by ticks, of which a
-    level on a busy machine skips some."""
+    level on a busy machine skips some.
+    """
 
     def __init__(self, segment: Segment, status: MailboxSpec) -> None:
         self._block = segment.block(status.writer)

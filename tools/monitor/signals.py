@@ -1,5 +1,6 @@
 """Signals of a running rack as they are written, from the rings of their mailboxes: no message is
-missed, and no board is held up."""
+missed, and no board is held up.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +24,8 @@ Rows = list[tuple[int, list[Any]]]
 
 class Written(NamedTuple):
     """Messages of one mailbox, oldest first, with the ticks at which they were released; before
-    them, `lost` were overwritten."""
+    them, `lost` were overwritten.
+    """
 
     mailbox: str
     ticks: np.ndarray
@@ -40,7 +42,8 @@ class SignalTap:
 
     def take(self) -> Iterator[Written]:
         """Yield what was written since the last call; at the first one, what the rings still hold:
-        2 s of simulated time."""
+        2 s of simulated time.
+        """
         for name, ring in self._rings.items():
             rows, lost = ring.drain()
             if len(rows) or lost:
@@ -63,7 +66,8 @@ class Strip:
         followed: Sequence[Signal] = (),
     ) -> None:
         """Keep `span` ticks, and for each mailbox the message before them; of signals that are only
-        `followed`, nothing."""
+        `followed`, nothing.
+        """
         specs = [segment.layout.mailbox(signal.mailbox) for signal in signals]
         self.signals = signals
         self.tick_s = segment.layout.clock_ns * 1e-9
@@ -97,7 +101,8 @@ class Strip:
 
     def table(self, first: int, last: int) -> Rows:
         """Return a row for each tick from `first` to `last` at which one of the signals was
-        released."""
+        released.
+        """
         changes = [one for many in self._changes.values() for one in many if one[0] <= last]
         newest: dict[str, Any] = {}
         table: dict[int, list[Any]] = {}
@@ -123,7 +128,8 @@ def cell(value: Any) -> str:
 
 class Lines:
     """Signals as lines of text, or of JSON documents: one every `every` ticks, or with 0 one for
-    each tick at which a signal was released; the `first` tick begins."""
+    each tick at which a signal was released; the `first` tick begins.
+    """
 
     def __init__(self, strip: Strip, first: int, every: int, as_json: bool) -> None:
         self._strip = strip
@@ -150,7 +156,8 @@ class Lines:
 
 class Plot:
     """Signals as curves on the terminal: `span` ticks of them. Raises `ImportError` without
-    plotext."""
+    plotext.
+    """
 
     def __init__(self, strip: Strip, span: int, terminal: Console) -> None:
         import plotext
@@ -186,7 +193,8 @@ class Plot:
 
     def _curves(self, rows: Rows) -> dict[str, list[tuple[float, float]]]:
         """Return points by the name of the curve: a signal with several numbers has one for
-        each."""
+        each.
+        """
         curves = defaultdict(list)
         for tick, values in rows:
             for signal, value in zip(self._strip.signals, values, strict=True):

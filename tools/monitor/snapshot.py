@@ -1,5 +1,6 @@
 """A snapshot of a running rack, from the host side: one row a task, what holds the rack, the
-progress of its task."""
+progress of its task.
+"""
 
 from __future__ import annotations
 
@@ -119,7 +120,8 @@ class Snapshot:
 
 class RackMonitor:
     """Takes snapshots of one rack; each covers the cycles since the one before, with
-    `keeps_longest` all since the first, or since `forget_times`."""
+    `keeps_longest` all since the first, or since `forget_times`.
+    """
 
     def __init__(self, segment: Segment, keeps_longest: bool = False) -> None:
         self._segment = segment
@@ -242,7 +244,8 @@ class RackMonitor:
 
     def _times_ms(self, task: str) -> list[float | None]:
         """Return the longest execution and lateness of a task; where a look sees no cycle, as
-        before."""
+        before.
+        """
         self.cycles[task] = cycles = self._traces[task].drain().rows
         longest = self._longest_ns.get(task)
         if len(cycles):
@@ -265,7 +268,8 @@ class RackMonitor:
 
 def fired(status: AnyMessage) -> str:
     """Return what fired of a state table in a level's newest cycle, as text; empty for a level
-    without one."""
+    without one.
+    """
     if not {"row", "fired", "in_state", "table"} <= {*(status.record.dtype.names or ())}:
         return ""
     what = f"row {status.row} '{status.fired}'" if status.row else "no row"

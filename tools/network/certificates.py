@@ -175,7 +175,8 @@ def write_credentials(folder: Path, files: Mapping[str, bytes]) -> None:
 
 def named_addresses(entries: Iterable[str]) -> dict[str, list[str]]:
     """Return the addresses by name from texts as in cell=10.0.0.1,cell.local or operator. Raises
-    `Failure`."""
+    `Failure`.
+    """
     found: dict[str, list[str]] = {}
     for entry in entries:
         name, has_addresses, rest = entry.partition("=")

@@ -45,7 +45,8 @@ LOOK_S = 0.2
 
 class EstopSession:
     """A session at one host, in a context. Raises `Failure` when nobody is there, or it refuses
-    this operator."""
+    this operator.
+    """
 
     def __init__(self, address: RackAddress, operator: Operator) -> None:
         self._address = address
@@ -84,7 +85,8 @@ class EstopSession:
 
     def launch(self) -> int:
         """Return the number of the rack's launch. Raises `Failure` when it is not there: it names
-        those that are."""
+        those that are.
+        """
         rack = self._address.rack
         self._await(lambda: self._launches, CONNECT_S)
         self._await(lambda: rack in self._launches, OTHERS_S)
@@ -160,7 +162,8 @@ class EstopSession:
 
 def stop(address: RackAddress, operator: Operator) -> int:
     """Set the emergency stop of a rack; return the tick at which that was done. Raises
-    `Failure`."""
+    `Failure`.
+    """
     with EstopSession(address, operator) as session:
         return session.set_stop(session.launch())
 

@@ -30,7 +30,7 @@ def certificates(
     days: int = option("--days N", "validity, days", YEAR, min=1, max=3650),
     as_json: Json = False,
 ) -> None:
-    """Make a set of certificates for tests: an authority, and a pair for each name.
+    r"""Make a set of certificates for tests: an authority, and a pair for each name.
 
     Racks know each other by name: the common name of a certificate is the name of the rack, and
     what a rack may send and read depends on it. Give a rack that listens the addresses or host

@@ -52,7 +52,8 @@ class InBoth:
 @dataclass(frozen=True)
 class Clue:
     """What may be the cause: of `run` alone, or of both where that is empty; `tick` -1: from the
-    beginning."""
+    beginning.
+    """
 
     kind: ClueKind
     text: str
@@ -63,7 +64,8 @@ class Clue:
 
 class Told(NamedTuple):
     """An event as a clue; `key` is equal for what happened alike in both runs, `about` names the
-    boards, tasks and mailboxes that it concerns."""
+    boards, tasks and mailboxes that it concerns.
+    """
 
     key: tuple[str, ...]
     about: tuple[str, ...]
@@ -89,7 +91,8 @@ class UnlikeCycle:
 
 class Divergence:
     """Two runs that diverge, or do not; `unlike` are the first messages that differ, by mailbox,
-    the earliest first. Raises `Failure` as `unlike_messages` does."""
+    the earliest first. Raises `Failure` as `unlike_messages` does.
+    """
 
     def __init__(self, one: Recording, other: Recording) -> None:
         self.runs = one, other
@@ -98,7 +101,8 @@ class Divergence:
 
     def chain(self, mailbox: str = "") -> tuple[UnlikeCycle, ...]:
         """Return the cycles from the first message that differs, of all or of this mailbox, back to
-        the cause. Raises `Failure` for a mailbox that does not exist."""
+        the cause. Raises `Failure` for a mailbox that does not exist.
+        """
         if mailbox:
             mailbox_of(mailbox, self.runs[0].layout.timed)
         name = mailbox or next(iter(self.unlike), "")
@@ -132,7 +136,8 @@ class Divergence:
 
     def _was_unequal(self, source: MailboxSpec, reader: str, unlike: UnlikeMessage) -> bool:
         """Say whether a task had read otherwise in a mailbox, until the cycle in which it wrote
-        otherwise."""
+        otherwise.
+        """
         found = self.unlike.get(source.name)
         grid = self.runs[0].layout.read_grid(source, reader)
         at = unlike.tick - (unlike.tick - grid.phase) % grid.every

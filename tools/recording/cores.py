@@ -32,7 +32,8 @@ _MS = 1000 // os.sysconf("SC_CLK_TCK")
 
 class Stolen(NamedTuple):
     """Time stolen from a core between two looks (CLOCK_MONOTONIC); the kernel counts in steps of 10
-    ms."""
+    ms.
+    """
 
     from_ns: int
     to_ns: int

@@ -102,7 +102,8 @@ def cycles_of(recording: Recording) -> dict[str, Cycles]:
 
 def _settled(recording: Recording, task: str, ticks: np.ndarray) -> np.ndarray:
     """Return which cycles do not belong to the start-up of a process; all where none would be
-    left."""
+    left.
+    """
     span = round(START_UP_S * 1e9 / recording.layout.clock_ns)
     settled = np.ones(len(ticks), bool)
     for begun in (0, *restarts(recording).get(task, ())):

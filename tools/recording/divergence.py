@@ -24,7 +24,8 @@ Heads = Mapping[str, np.ndarray]
 @dataclass(frozen=True)
 class Difference:
     """Where two runs diverge: the release tick of the first message that differs, and its
-    mailbox."""
+    mailbox.
+    """
 
     tick: int
     mailbox: str
@@ -47,7 +48,8 @@ class UnlikeMessage:
 def other_run(run: Path, named: Path, asked: str = "") -> Path:
     """Return the folder of the run that one is compared with: the one `named` or, for "origin", the
     one that it goes on from, where its user named it or next to it. Raises `Failure`, which begins
-    with what was `asked`."""
+    with what was `asked`.
+    """
     if str(named) != "origin":
         return named
     asked = f"{asked or '--against origin'}: {run}"
@@ -63,7 +65,8 @@ def other_run(run: Path, named: Path, asked: str = "") -> Path:
 
 def first_difference(one: Recording, other: Recording) -> Difference | None:
     """Return where two runs diverge, up to the end of the shorter one; None when all that both
-    wrote is equal. Raises `Failure` as `unlike_messages` does."""
+    wrote is equal. Raises `Failure` as `unlike_messages` does.
+    """
     found = unlike_messages(one, other)
     return Difference(found[0].tick, found[0].mailbox) if found else None
 
@@ -97,7 +100,8 @@ def ticks_of(recording: Recording) -> tuple[int, int]:
 
 def common_ticks(one: Recording, other: Recording) -> tuple[int, int]:
     """Return the ticks that two runs have in common, [first, end): one that goes on from another
-    begins later."""
+    begins later.
+    """
     begins, ends = zip(ticks_of(one), ticks_of(other), strict=True)
     return max(begins), min(ends)
 

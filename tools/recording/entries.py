@@ -1,5 +1,6 @@
 """What entered a recorded run from outside, so that it can be repeated: through its adapters, for a
-replay without host boards and other racks, and from its operators."""
+replay without host boards and other racks, and from its operators.
+"""
 
 from __future__ import annotations
 

@@ -45,7 +45,8 @@ class ChannelMessage(NamedTuple):
 
 def export(recording: Recording, path: Path, show: Callable[[float], None]) -> int:
     """Write the file; return its number of messages. `show` is called with the part that is
-    done."""
+    done.
+    """
     boxes = {box.name: box for box in recording.layout.mailboxes}
     found = [boxes[name] for name in recording.mailboxes]
     total = sum(len(recording.signal(box.name, "serial")) for box in found)
@@ -75,7 +76,8 @@ def _channel(writer: Writer, topic: str, message: str, schema: Document) -> int:
 
 def _schema(box: MailboxSpec) -> Document:
     """Return the JSON schema of a message; groups of fields are flattened, as in the parquet
-    files."""
+    files.
+    """
     head = {
         "serial": {"type": "integer", "description": "of the message, rising by one"},
         "tick": {"type": "integer", "description": "release of the cycle that wrote it"},

@@ -108,7 +108,8 @@ def holds(recording: Recording) -> list[Document]:
 
 def fired_rows(recording: Recording) -> dict[str, list[Document]]:
     """Return, by level with state tables, the rows that fired: table, row, name, cycles, and when
-    first."""
+    first.
+    """
     found = {}
     for mailbox in recording.mailboxes:
         if not {"table", "row", "fired"} <= recording.fields(mailbox):
@@ -167,6 +168,7 @@ def _holds_of(recording: Recording, level: str) -> Iterator[Document]:
 
 def _stretches(what: np.ndarray) -> list[tuple[int, int]]:
     """Return the stretches of equal numbers other than 0, each as its first place and the one after
-    its last."""
+    its last.
+    """
     borders = [0, *(np.flatnonzero(np.diff(what)) + 1).tolist(), len(what)]
     return [(first, end) for first, end in pairwise(borders) if first < end and what[first]]

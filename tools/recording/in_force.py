@@ -1,5 +1,6 @@
 """The messages of a recorded run that are in force at a tick, and the ticks at which a condition
-begins to hold: what readers released then find. Any tick comes from the recording alone."""
+begins to hold: what readers released then find. Any tick comes from the recording alone.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +25,8 @@ class InForce:
 
     def begins(self, condition: Trigger) -> np.ndarray:
         """Return the ticks at which readers find a condition to hold that did not hold in the
-        message before, (times,), the earliest first."""
+        message before, (times,), the earliest first.
+        """
         rows = self._of(condition.signal.mailbox)
         holds = condition.holds(rows["message"])
         held_before = np.concatenate((np.zeros(1, bool), holds[:-1]))

@@ -50,7 +50,8 @@ class Retention(NamedTuple):
         self, segment: Segment, kept: Sequence[tuple[int, int]], ticks: int
     ) -> list[TickRange]:
         """Return what had to be kept of a run of `ticks`, as far as its alarm rings still say, and
-        is not within the ticks `kept`, [first, end)."""
+        is not within the ticks `kept`, [first, end).
+        """
         occasions = Occasions(segment).alarms()
         wanted = [TickRange(max(0, ticks - self.keep), ticks - 1), *map(self.around, occasions)]
         clipped = [TickRange(first, min(last, ticks - 1)) for first, last in wanted]

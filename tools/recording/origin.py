@@ -46,7 +46,8 @@ def write_code(config: RackConfig, folder: Path) -> None:
 
 def check_code(recording: Recording, asked: str, anyway: bool) -> None:
     """Note on stderr what has changed since a run, if it is to be repeated `anyway`. Raises
-    `Failure`, which begins with what was `asked`, if it is not."""
+    `Failure`, which begins with what was `asked`, if it is not.
+    """
     path = recording.folder / CODE
     if not path.exists():
         why = f"it has no {CODE}: 'rack record' or an older version recorded it"
@@ -102,7 +103,8 @@ class Origin:
     @classmethod
     def of(cls, recording: Recording) -> Self | None:
         """Return it for a recorded run; None for one that goes on from no other. Raises `Failure`
-        for a damaged file."""
+        for a damaged file.
+        """
         path = recording.folder / ORIGIN
         if not path.exists():
             return None

@@ -91,7 +91,8 @@ class CyclesFile:
         kept: Sequence[tuple[int, int]],
     ) -> None:
         """Finish the file; store as metadata the rows lost by task and by mailbox, what the machine
-        did to its cores, the gaps, and the ticks of the stretches that a flight recorder kept."""
+        did to its cores, the gaps, and the ticks of the stretches that a flight recorder kept.
+        """
         self._flush()
         metadata = {
             "lost": encode_json(lost),
@@ -105,7 +106,8 @@ class CyclesFile:
 
 def signal_tables(folder: Path, layout: Layout) -> dict[str, SignalTable]:
     """Return the tables of signals/, by mailbox; what a killed recorder has left there is
-    replaced."""
+    replaced.
+    """
     if folder.exists():
         rmtree(folder)
     return {
@@ -229,7 +231,8 @@ class Column:
 
 def columns_of(mailbox: MailboxSpec) -> list[Column]:
     """Return the columns of a mailbox in the order of its fields; groups of fields are
-    flattened."""
+    flattened.
+    """
     return list(_columns(mailbox.name, (), (), mailbox.fields))
 
 

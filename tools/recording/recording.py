@@ -41,7 +41,8 @@ from rack.tools.recording.spool import STRETCHES, rings
 
 class Gap(NamedTuple):
     """Ticks of which a recording lacks rows, from the first to the last, and of which tasks and
-    mailboxes."""
+    mailboxes.
+    """
 
     first: int
     last: int
@@ -121,7 +122,8 @@ class Recording:
 
     def adopt_kinds(self) -> None:
         """Let this process know the kinds of faults that the rack's own levels add. Raises
-        `Failure`."""
+        `Failure`.
+        """
         path = self.folder / PUBLISHED
         if path.exists():
             self.checksums.verify(PUBLISHED)
@@ -178,7 +180,8 @@ class Recording:
     @cached_property
     def ended(self) -> Document:
         """Counts at the end of the run, as in `rack.tools.launch.launch.RunResult`. Empty if they
-        are not recorded."""
+        are not recorded.
+        """
         return next((event for event in self.events if event["kind"] == "outcome"), {})
 
     @property
@@ -188,7 +191,8 @@ class Recording:
 
     def stretch_of(self, ticks: np.ndarray) -> np.ndarray:
         """Return the number of the stretch of each tick, shape (n,): what lies between two of them
-        is unknown. All are of one where everything was kept."""
+        is unknown. All are of one where everything was kept.
+        """
         # Some rows are later than the end of their stretch, or of releases before its begin.
         second = round(1e9 / self.layout.clock_ns)
         borders = [
@@ -247,7 +251,8 @@ class Recording:
 
     def missing(self, segment: Segment) -> dict[str, Missing]:
         """Return what the files lack of the rings of a rack that has ended, by task and by
-        mailbox."""
+        mailbox.
+        """
         taken = {}
         lost = dict(self.lost)
         for name, ring in rings(segment).items():
@@ -264,7 +269,8 @@ class Recording:
     @cached_property
     def cycles(self) -> dict[str, np.ndarray]:
         """The trace by task: structured rows, oldest first, with the fields of
-        `rack.backplane.trace.RECORD`."""
+        `rack.backplane.trace.RECORD`.
+        """
         with _naming(self.folder / CYCLES):
             table = self._cycles.read()
             tasks = table["task"].to_numpy()
@@ -279,7 +285,8 @@ class Recording:
 
     def place(self, task: TaskSpec) -> tuple[int, int]:
         """Return core and priority that a task obtained; those of the config where the run's end is
-        not recorded."""
+        not recorded.
+        """
         counted = self.counts(task.name)
         return counted.get("core", task.core), counted.get("priority", task.priority)
 
@@ -305,13 +312,15 @@ class Recording:
 
     def reason(self, mailbox: str, row: int) -> str:
         """Return the reason in a status, for people; empty for one of a user's level without
-        one."""
+        one.
+        """
         has_reason = "reason" in self.fields(mailbox)
         return printable(str(self.signal(mailbox, "reason")[row])) if has_reason else ""
 
     def rows(self, name: str) -> np.ndarray:
         """Return what a recorder took from a ring, oldest first: trace records of a task, or
-        messages of a mailbox."""
+        messages of a mailbox.
+        """
         if name in self.cycles:
             return self.cycles[name]
         box = self.layout.mailbox(name)
@@ -346,7 +355,8 @@ def _naming(path: Path) -> Iterator[None]:
 
 def _event(line: str, place: str) -> Document:
     """Return an event from its line, as `read_line` does. Raises `Failure`, which names the
-    place."""
+    place.
+    """
     try:
         event = read_line(line)
         if event["kind"] == "outcome":

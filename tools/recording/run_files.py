@@ -1,5 +1,6 @@
 """What a recorder leaves in the folder of a run: cycles.parquet and signals/, made as rows come, or
-later from its spool."""
+later from its spool.
+"""
 
 from __future__ import annotations
 
@@ -222,7 +223,8 @@ def mend(folder: Path) -> bool:
 
 def tally(folder: Path) -> Tally | None:
     """Return what a flight recorder has left in a folder, by the counts of its frames;
-    None where none has. Raises `Failure` when it cannot be read."""
+    None where none has. Raises `Failure` when it cannot be read.
+    """
     path = folder / SPOOL
     if not path.is_file() or not (folder / STRETCHES).is_dir():
         return None

@@ -1,5 +1,6 @@
 """A signal, as users name it: a field of the messages of a mailbox, or one number of it, as in
-`servo.status.position[2]`; and a condition on one, as in `servo.status.position[2] > 1.2`."""
+`servo.status.position[2]`; and a condition on one, as in `servo.status.position[2] > 1.2`.
+"""
 
 from __future__ import annotations
 
@@ -50,7 +51,8 @@ class Signal(Column):
     @classmethod
     def of(cls, text: str, boxes: Sequence[MailboxSpec]) -> Signal:
         """Return the signal of that name. Raises `Failure` with the nearest names, or the permitted
-        indices."""
+        indices.
+        """
         known = cls.all(boxes)
         found = NAME.fullmatch(text)
         if found is None or found[1] not in known:
@@ -88,7 +90,8 @@ class Signal(Column):
 
     def values(self, messages: np.ndarray) -> np.ndarray:
         """Return it in each of these messages, shape (messages, *what is left of its own): a
-        view."""
+        view.
+        """
         return self.part(super().values(messages))
 
     def part(self, values: np.ndarray) -> np.ndarray:
@@ -111,7 +114,8 @@ class Signal(Column):
 
     def plain(self, messages: np.ndarray) -> list[Any]:
         """Return it in each of these messages as users read it: numbers, names of states, text,
-        lists of them; None for what is not finite."""
+        lists of them; None for what is not finite.
+        """
         values = self.values(messages)
         if values.dtype.kind == "S":
             values = np.vectorize(text_of, "O")(values)

@@ -102,7 +102,8 @@ class StretchHead(NamedTuple):
 
 class StretchEnd(NamedTuple):
     """The last line of a stretch, which holds what ended before this tick; a recorder that was
-    killed leaves none."""
+    killed leaves none.
+    """
 
     tick: int
 
@@ -157,7 +158,8 @@ class Spool:
 
     def divert(self, stretch: StretchHead, end: int) -> Path:
         """Finish the stretch that is being written, which ends at a tick, and write what is added
-        from now on into another; return its file."""
+        from now on into another; return its file.
+        """
         self.flush(now=True)
         self._finish_stretch(end)
         path = self._folder / STRETCHES / f"{stretch.number:08}.spool"
@@ -179,7 +181,8 @@ class Spool:
 
     def flush(self, now: bool = False) -> bool:
         """Write what waits, when it is due or `now`; return whether it did. Raises `OSError` when
-        the disk is full."""
+        the disk is full.
+        """
         if not now and time.monotonic() < self._flush_at:
             return False
         self._flush_at = time.monotonic() + FLUSH_S
@@ -212,7 +215,8 @@ def _write(file: IO[bytes], part: SpoolHead | Part) -> None:
 
 def _read_parts(file: IO[bytes], path: Path) -> Iterator[Any]:
     """Yield what the lines of a spool or stretch hold, up to the last whole one. Raises `Failure`
-    for a damaged line."""
+    for a damaged line.
+    """
     while line := file.readline().decode(errors="replace"):
         is_whole = line.endswith("\n")
         if not is_whole and is_cut_off(line):

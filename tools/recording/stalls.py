@@ -38,7 +38,8 @@ at few phases: at two, if its cycle is half the period.
 @dataclass(frozen=True)
 class Absence:
     """A core that was away without steal: how often, the longest time, and the cycles lost
-    meanwhile."""
+    meanwhile.
+    """
 
     core: int
     times: int
@@ -62,7 +63,8 @@ class Quota:
 @dataclass(frozen=True)
 class Stalls:
     """What took the cycles of a run: `lost` counts all, late or skipped, `during_steal` those due
-    while it rose."""
+    while it rose.
+    """
 
     lost: int
     during_steal: int
@@ -164,7 +166,8 @@ class _Cycles:
 
     def unstamped(self, here: np.ndarray, is_shown: bool) -> tuple[np.ndarray, np.ndarray]:
         """Return since when each cycle of a core was due and no task left a stamp there, until it
-        started."""
+        started.
+        """
         rows = self.rows[here]
         starts = rows["start_ns"]
         due_ns = np.where(is_shown & self.is_urgent, self.due_ns, self.rows["start_ns"])[here]

@@ -70,7 +70,8 @@ class RackGrid:
 @dataclass(frozen=True)
 class Shift:
     """How far CLOCK_MONOTONIC of one machine is ahead of another's: `by_ns`, at `at_ns` of the
-    first; both (n,)."""
+    first; both (n,).
+    """
 
     at_ns: Ints
     by_ns: Ints
@@ -99,7 +100,8 @@ class Mark(NamedTuple):
 class RackPlace:
     """A recorded rack on the time line: by what shifts its clock leads to the first rack's; without
     any it is there tick by tick, as the first one itself, racks in lockstep, and, `by_ticks`, two
-    runs of one rack. `marks`: what a user should know of it, unless it is the first one."""
+    runs of one rack. `marks`: what a user should know of it, unless it is the first one.
+    """
 
     own: RackGrid
     line: RackGrid
@@ -132,7 +134,8 @@ class RackPlace:
 
     def times_ns(self, ticks: Ints, within_ns: Ints | int) -> Ints:
         """Return simulated times on the line of its ticks, and `within_ns` of its own simulated
-        time later."""
+        time later.
+        """
         if not self.shifts:
             return ticks * self.own.clock_ns + within_ns
         return self.line.time_ns(self.stamps_ns(self.own.stamp_ns(ticks, within_ns)))
@@ -220,7 +223,8 @@ def _check_company(grid: RackGrid, others: Sequence[RackGrid]) -> None:
 
 def _way(own: RackGrid, other: RackGrid) -> tuple[Shift, ...] | None:
     """Return the shift that leads from a rack's clock to another's, if either has compared them; in
-    lockstep none."""
+    lockstep none.
+    """
     if own.is_lockstep:
         met = [_has_met(one, two) for one, two in ((own, other), (other, own))]
         return () if any(met) else None
@@ -283,7 +287,8 @@ def _sighting(of: RackGrid, peer: RackGrid) -> Shift | None:
 
 def _has_met(of: RackGrid, peer: RackGrid) -> bool:
     """Return whether a rack in lockstep worked with another. Raises `Failure` if that was not in
-    this run."""
+    this run.
+    """
     mailbox = _mailbox(of, peer)
     if mailbox is None or not (of.recording.signal(mailbox, "presence") == Presence.THERE).any():
         return False

@@ -52,7 +52,8 @@ def compared(recording: Recording, asked: OtherRun) -> Document:
 
 def _repeated(found: Divergence, last: UnlikeCycle, is_wanted: bool) -> Repetition | str:
     """Return what repeating a cycle shows, or why it is not repeated: "" if the recordings say
-    already that it was not the level's state or code."""
+    already that it was not the level's state or code.
+    """
     if last.unequal or any(clue.kind not in OF_CONFIG for clue in last.clues):
         return ""
     if not is_wanted:

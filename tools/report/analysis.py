@@ -1,5 +1,6 @@
 """A run compared with the timing model: every equation twice, predicted from the budgets and as
-measured."""
+measured.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +32,8 @@ OBSERVED = ("3.2", "3.3", "3.7", RESPONSE_TIME, LOAD)
 @dataclass(frozen=True)
 class Pair:
     """One equation put to one subject. `predicted` is None without a budget, `measured` if a run
-    cannot show it."""
+    cannot show it.
+    """
 
     equation: str
     subject: str
@@ -80,7 +82,8 @@ class Analysis:
         progress: Callable[[float], None] = lambda part: None,
     ) -> Analysis:
         """Analyze a recorded run; `progress` takes the part done. Raises `Failure` for an empty or
-        old trace."""
+        old trace.
+        """
         config = recording.rack_config
         layout = recording.layout
         cycles = cycles_of(recording)
@@ -137,7 +140,8 @@ def _key(verdict: EquationVerdict) -> tuple[str, str, str]:
 
 def _system(response: Mapping[str, Any] | None, rack: RackTiming) -> Iterator[EquationVerdict]:
     """Yield eq. 3.2 on the longest response of the run, and eq. 3.3 on the sum with its waits for
-    the grid."""
+    the grid.
+    """
     if response is None:
         return
     # The response is in simulated time.

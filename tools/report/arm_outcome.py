@@ -1,5 +1,6 @@
 """What the task, its objects and the arm or hand did, from a recording: as a report's data, and as
-its text."""
+its text.
+"""
 
 from __future__ import annotations
 
@@ -59,7 +60,8 @@ def objects(recording: Recording, config: RackConfig) -> Iterator[Document]:
 
 def _drops(recording: Recording, row: int) -> Iterator[Document]:
     """Yield tick and height, mm, of each fall of an object: it goes down quickly, and not with the
-    tool."""
+    tool.
+    """
     scene = signals_of(recording, Scene.message_type.name)
     if scene is None:
         return
@@ -79,7 +81,8 @@ def _drops(recording: Recording, row: int) -> Iterator[Document]:
 
 def motion(recording: Recording) -> Document | None:
     """Return tracking error, mrad, where a status tells it, and the counts of touches, exceeded
-    limits and refused or cut commands, or None."""
+    limits and refused or cut commands, or None.
+    """
     status = signals_of(recording, *DRIVING)
     counts = _counts(recording, status)
     if not counts or signals_of(recording, HAND_STATUS) is not None:
@@ -93,7 +96,8 @@ def motion(recording: Recording) -> Document | None:
 
 def _counts(recording: Recording, status: Signals | None) -> Document:
     """Return what an arm or a hand has counted, by its state, and what the board that drives it has
-    cut besides, by its status; nothing without either."""
+    cut besides, by its status; nothing without either.
+    """
     state = signals_of(recording, ArmState.message_type.name)
     if not (known := [found for found in (status, state) if found is not None]):
         return {}
@@ -117,7 +121,8 @@ def rounded(value: float) -> float:
 
 def hand(recording: Recording, config: RackConfig) -> Document | None:
     """Return a hand's tensions as far as commanded, N, its forces by finger, N, and its counts, or
-    None."""
+    None.
+    """
     status = signals_of(recording, HAND_STATUS)
     if status is None or config.robot is None or config.robot.hand is None:
         return None
@@ -138,7 +143,8 @@ def hand(recording: Recording, config: RackConfig) -> Document | None:
 
 def force(recording: Recording) -> Document | None:
     """Return what an arm's wrist has felt, N and N m, and how far forces were from those wanted, N,
-    or None."""
+    or None.
+    """
     wrench = signals_of(recording, WRENCH)
     status = signals_of(recording, FORCE_STATUS)
     if wrench is None:
@@ -160,7 +166,8 @@ def force(recording: Recording) -> Document | None:
 
 def signals_of(recording: Recording, *messages: str) -> Signals | None:
     """Return the signals of the first mailbox with messages of one of these types; None when it is
-    empty, or there is none."""
+    empty, or there is none.
+    """
     name = next((m.name for m in recording.layout.mailboxes if m.message in messages), None)
     return partial(recording.signal, name) if name in recording.mailboxes else None
 

@@ -44,7 +44,8 @@ class Repetition:
 
 class _Again(NamedTuple):
     """A repeated cycle: the attributes of its level before it, the mailboxes that are not as
-    recorded, and whether it wrote the same each time."""
+    recorded, and whether it wrote the same each time.
+    """
 
     attributes: Mapping[str, Any]
     unlike: tuple[str, ...]

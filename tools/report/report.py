@@ -47,7 +47,8 @@ COMPARISON = "rack.tools.report.against"
 @dataclass(frozen=True)
 class OtherRun:
     """The run in a folder that one is compared with: from where the mailbox `of` first differs, or
-    any; and whether both may be repeated."""
+    any; and whether both may be repeated.
+    """
 
     folder: Path
     of: str
@@ -119,7 +120,8 @@ def report_of(recording: Recording) -> Document:
 
 def unrecorded(config: RackConfig, ended: Mapping[str, Any]) -> Document:
     """Return the report of a run that was not recorded: the same keys, null where only a recording
-    could tell."""
+    could tell.
+    """
     layout = wire(config)
     head = _head(config, ended, 0, None)
     return replace(
@@ -137,7 +139,8 @@ def _head(
     config: RackConfig, ended: Mapping[str, Any], ticks: int, response: Document | None
 ) -> RunReport:
     """Return the part that needs no recording; `ticks` is the length of a run whose end is not
-    known."""
+    known.
+    """
     outcome = ended.get("outcome", {})
     counters = ended.get("tasks", {}).values()
     return RunReport(
@@ -175,7 +178,8 @@ def _task(recording: Recording, config: RackConfig, task: TaskSpec) -> Document:
 
 def plan_ages_ms(recording: Recording, board: str) -> np.ndarray:
     """Return the age of the plan that each cycle of a board's executor could read, simulated time;
-    see `plan_ages`."""
+    see `plan_ages`.
+    """
     plan = f"{board}.plan"
     made = recording.signal(plan, "tick")
     visible_at = recording.signal(plan, "visible_at")
@@ -195,7 +199,8 @@ def _about(task: TaskSpec, layout: Layout) -> Document:
 
 def _entries(recording: Recording) -> list[Document]:
     """Return the entries of all bus adapters: their counts at the end, and the ages of what passed,
-    ms."""
+    ms.
+    """
     found = []
     tick_ms = recording.layout.clock_ns * 1e-6
     for mailbox, entry, source in entries_of(recording.layout, recording.config):
@@ -210,7 +215,8 @@ def _entries(recording: Recording) -> list[Document]:
 
 def network(recording: Recording) -> Document | None:
     """Return counts and ages, ms, of what passed, and losses of other racks; None: no adapter, or
-    nothing recorded."""
+    nothing recorded.
+    """
     entries = exchanged(recording.config)
     if entries is None or STATUS not in recording.mailboxes:
         return None

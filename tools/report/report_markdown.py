@@ -129,7 +129,8 @@ def _holds(rack: str, holds: Sequence[Document]) -> Blocks:
 
 def _state_tables(levels: dict[str, list[Document]]) -> TextTable:
     """Return one line a level: the table, how many rows fired, and those that fired first and
-    last."""
+    last.
+    """
     rows = []
     for level, fired in levels.items():
         most = max(fired, key=lambda row: row["cycles"])
@@ -151,7 +152,8 @@ def _state_tables(levels: dict[str, list[Document]]) -> TextTable:
 
 def _machine(report: RunReport) -> Iterator[str]:
     """Yield what the machine did to its cores: when they were away, by whom if that is known;
-    changes of frequency."""
+    changes of frequency.
+    """
     steal = report.steal
     stalls = report.stalls
     frequency = report.frequency_mhz or {}

@@ -20,7 +20,8 @@ FLOORS = ("backplane", "levels", "boards", "tools")
 
 def stored_report(folder: Path) -> tuple[Document, str] | None:
     """Return the report in the folder of a run, as data and as text; None if it must be made
-    anew, as of a recording that has been damaged since."""
+    anew, as of a recording that has been damaged since.
+    """
     try:
         checksums = Checksums(folder)
         kept = (*FILES, *RECORDED)
@@ -42,7 +43,8 @@ def stored_report(folder: Path) -> tuple[Document, str] | None:
 
 def newest_report(folder: Path) -> tuple[Document, str]:
     """Return the report of a run: the one in its folder if that is still right, otherwise a new
-    one."""
+    one.
+    """
     report = stored_report(folder)
     if report is None:
         # It takes long to import.
@@ -59,7 +61,8 @@ def show_report(run: str | Path, as_json: bool) -> None:
 
 def print_report(data: Document, text: str, as_json: bool) -> None:
     """Print a report: as one JSON document; on a terminal as much as fits; elsewhere, or of no
-    recording, `text`."""
+    recording, `text`.
+    """
     if as_json:
         print_json(data)
         return

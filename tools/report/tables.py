@@ -21,7 +21,8 @@ _Side = LevelTiming | EquationVerdict | None
 
 def document(analysis: Analysis) -> Document:
     """Return everything as plain data; infinite numbers are null. report.json has restarts and
-    the system's response."""
+    the system's response.
+    """
     recording = analysis.recording
     config = recording.rack_config
     return {
@@ -72,7 +73,8 @@ def _sides(predicted: _Side, measured: _Side) -> Document:
 
 def task_document(cycles: Cycles, rack: RackTiming) -> Document:
     """Return the times of the judged cycles of one task, ms, as `task_times` of their processor
-    times."""
+    times.
+    """
     judged = cycles.is_judged
     rows = cycles.rows[judged]
     missed, skipped = counts(rows)
@@ -100,7 +102,8 @@ def task_document(cycles: Cycles, rack: RackTiming) -> Document:
 
 def analysis_blocks(analysis: Analysis, is_verbose: bool) -> Blocks:
     """Yield an analysis as text: how the run ended, what held, and what to do; if verbose, every
-    level, task and equation."""
+    level, task and equation.
+    """
     yield from _head(analysis)
     if not is_verbose:
         yield "--verbose shows every level, task and equation"

@@ -1,5 +1,6 @@
 """Times of the cycles of tasks: as data, and as the one table that `rack report` and `rack analyze`
-show."""
+show.
+"""
 
 from __future__ import annotations
 

@@ -49,7 +49,8 @@ class ArmParts:
 
 def find_arm(model: mujoco.MjModel, tip: str, joints: Sequence[str]) -> ArmParts:
     """Return the arm that ends at the body or site `tip`, or has these `joints`; of neither is
-    told, the longest. Raises `RobotError`."""
+    told, the longest. Raises `RobotError`.
+    """
     driven = driven_joints(model)
     scalar = np.isin(model.jnt_type, SCALAR_JOINTS)
     others: list[int] = []
@@ -98,7 +99,8 @@ def find_arm(model: mujoco.MjModel, tip: str, joints: Sequence[str]) -> ArmParts
 
 def driven_joints(model: mujoco.MjModel) -> set[int]:
     """Return the joints for which a model states a drive: an actuator, by itself or through a
-    tendon, the effort of a URDF, or a coupling to other joints."""
+    tendon, the effort of a URDF, or a coupling to other joints.
+    """
     every = np.arange(model.njnt)
     drives = actuator_moments(model, every, model.qpos0[model.jnt_qposadr]).any(axis=0)
     own = every[drives | model.jnt_actfrclimited]
@@ -107,7 +109,8 @@ def driven_joints(model: mujoco.MjModel) -> set[int]:
 
 def hold(path: Path, kept: Iterable[str]) -> list[str]:
     """Take out of an MJCF file, as MuJoCo writes it, all joints but those `kept`, bodies that fly
-    or that something outside moves, and what refers to them; return those bodies."""
+    or that something outside moves, and what refers to them; return those bodies.
+    """
     tree = ElementTree.parse(path)
     root = tree.getroot()
     moving = {("joint", name) for name in kept}

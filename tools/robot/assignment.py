@@ -1,5 +1,6 @@
 """Something to do for a drafted arm: a table with two blocks that it moves, or a tour of poses;
-either is rehearsed as the task level will."""
+either is rehearsed as the task level will.
+"""
 
 from __future__ import annotations
 
@@ -80,7 +81,8 @@ class Assignment:
 
 def lay_out(made: Draft) -> Assignment:
     """Return what the arm can do, its home fit for that; the model gets table and blocks. Raises
-    `RobotError`."""
+    `RobotError`.
+    """
     if made.jaws is not None:
         found = _pick_and_place(made, made.jaws)
         if isinstance(found, Assignment):

@@ -1,5 +1,6 @@
 """From a model to a `[robot]` table: what the model states is taken, the rest found or guessed, and
-each guess named."""
+each guess named.
+"""
 
 from __future__ import annotations
 
@@ -120,7 +121,8 @@ class Draft:
 
     def search_home(self, scene: SceneConfig = NOTHING, ends: Sequence[Array] = ()) -> None:
         """Set home to a pose in which the arm carries itself, free before and after the objects of
-        the scene are at their `ends`, m. Raises `RobotError`."""
+        the scene are at their `ends`, m. Raises `RobotError`.
+        """
         cell = self.cell(scene)
         data = cell.start()
         checkers = [CollisionChecker(cell, scene)]
@@ -135,7 +137,8 @@ class Draft:
 
 def draft(source: Source, wanted: Wishes, folder: Path, name: str) -> Draft:
     """Return the arm of a model, as `rack run` takes it: a gripper that it would refuse is held.
-    Raises `RobotError`, one line."""
+    Raises `RobotError`, one line.
+    """
     try:
         made = _draft(source, wanted, folder, name)
     except RobotError as error:
@@ -291,7 +294,8 @@ def touching(
     cell: Cell, data: mujoco.MjData, q: Array, skin_m: float = SKIN_M
 ) -> set[tuple[str, str]]:
     """Return the pairs of bodies in unintended contact at `q`, or closer than `skin_m`, if geoms
-    have that margin."""
+    have that margin.
+    """
     model = cell.model
     data.qpos[cell.qpos] = q
     mujoco.mj_fwdPosition(model, data)
@@ -302,7 +306,8 @@ def touching(
 
 def _dimension(made: Draft, unknown: list[bool], guessed: list[bool]) -> None:
     """Set the torques that are unknown, the velocities that are guessed, accelerations that the
-    motors can give, and a loop that is stiff against dry friction."""
+    motors can give, and a loop that is stiff against dry friction.
+    """
     cell = made.cell()
     dynamics = Dynamics(cell)
     velocity = np.array(made.table["velocity"])
@@ -351,7 +356,8 @@ def _home(
     cell: Cell, checkers: Sequence[CollisionChecker], starts: Mapping[str, Array], wanted: str
 ) -> tuple[list[float], str]:
     """Return home, and why if it is a guess: a keyframe that serves, or the best pose that does.
-    Raises `RobotError`."""
+    Raises `RobotError`.
+    """
     first, *later = checkers
     statics = Statics(cell)
     low, high = cell.limits.position.T

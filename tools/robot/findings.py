@@ -139,7 +139,8 @@ def _elsewhere(cell: Cell, config: GripperConfig) -> str:
 
 def _fastest(cell: Cell) -> tuple[float, float]:
     """Return the fastest vibration against springs and the gripper's loop: its angle in a step,
-    rad, and its frequency, Hz."""
+    rad, and its frequency, Hz.
+    """
     model = cell.model
     data = cell.start()
     inertia = np.zeros((model.nv, model.nv))

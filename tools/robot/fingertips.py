@@ -1,5 +1,6 @@
 """What the fingers of a gripper can take, and the tool between them, by rays on their surfaces: two
-fingers, or one that closes on a jaw that stands still."""
+fingers, or one that closes on a jaw that stands still.
+"""
 
 from __future__ import annotations
 
@@ -55,7 +56,8 @@ class Fingertips(NamedTuple):
 
 def find_fingertips(cell: Cell, tip: str, is_one: bool = False) -> Fingertips:
     """Return what the gripper can take; `is_one` is known of meshes cut to pieces. Raises
-    `RobotError` where nothing closes, or not on a block."""
+    `RobotError` where nothing closes, or not on a block.
+    """
     fingers = _Fingers(cell, tip, is_one)
     out = fingers.out
     across = fingers.across
@@ -144,7 +146,8 @@ class _Fingers:
 
     def places(self) -> list[Array]:
         """Return places between the fingers, the outermost first; of a single finger next to the
-        jaw."""
+        jaw.
+        """
         places = [self._middle + self.out * step * STEP_M for step in range(60, -40, -1)]
         if not self.is_one:
             return places
@@ -166,7 +169,8 @@ class _Fingers:
 
 def tool_outward(cell: Cell, body: str) -> tuple[str, ToolConfig | None]:
     """Return the tool of an arm that ends at a body, z along the last joint, outward: a site of the
-    model, or a place on the body."""
+    model, or a place on the body.
+    """
     model = cell.model
     data = cell.start()
     at = data.xpos[model.body(body).id]

@@ -38,7 +38,8 @@ def fit_fingers(
     spec: mujoco.MjSpec, model: mujoco.MjModel, arm: ArmParts, wanted: str
 ) -> tuple[GripperConfig, str]:
     """Give the gripper one drive, at the joint `wanted` if that is named, which all that nothing
-    couples to it follows; return its table, and what of it is guessed. Raises `RobotError`."""
+    couples to it follows; return its table, and what of it is guessed. Raises `RobotError`.
+    """
     fingers = {name: _finger(spec, model, arm, name) for name in arm.fingers}
     drives = [
         (actuator, found[0])
@@ -88,7 +89,8 @@ def fit_fingers(
 
 def _finger(spec: mujoco.MjSpec, model: mujoco.MjModel, arm: ArmParts, name: str) -> _Finger:
     """Return the ends of a joint of the gripper: it closes where it moves to the middle of all
-    fingers, or to the hand. Raises `RobotError`."""
+    fingers, or to the hand. Raises `RobotError`.
+    """
     joint = model.joint(name).id
     low, high = model.jnt_range[joint]
     if not model.jnt_limited[joint]:
@@ -145,7 +147,8 @@ def _ratio(
     model: mujoco.MjModel, leader: tuple[str, _Finger], follower: tuple[str, _Finger]
 ) -> float:
     """Return the ratio by which a joint closes as the driven one does: as far, if it is of the
-    same kind, else in its range; 0 if it does not close."""
+    same kind, else in its range; 0 if it does not close.
+    """
     (driven, lead), (name, own) = leader, follower
     if own.sideways:
         return 0.0

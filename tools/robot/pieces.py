@@ -1,5 +1,6 @@
 """Meshes of a gripper as convex pieces: MuJoCo simulates a mesh by its hull, which fills the bend
-of a jaw, and leaves no room for what one finger could take."""
+of a jaw, and leaves no room for what one finger could take.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +24,8 @@ KEPT_ROWS = ("friction", "solref", "solimp", "rgba")
 
 def cut_meshes(spec: mujoco.MjSpec, cell: Cell, out: Array) -> int:
     """Cut what is solid of the gripper's meshes across the way `out`, (3,), of the closed gripper
-    with the arm at its start; from then on the whole meshes are only seen. Return how many."""
+    with the arm at its start; from then on the whole meshes are only seen. Return how many.
+    """
     data = cell.start()
     assert cell.gripper is not None, "it has meshes"
     cell.gripper.linkage.set(data.qpos, cell.gripper.closed)

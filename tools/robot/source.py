@@ -1,5 +1,6 @@
 """A model from anywhere as an `MjSpec`: MJCF, or URDF by MuJoCo's own parser with its meshes
-found."""
+found.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +48,8 @@ class Source:
 
 def read_source(path: Path) -> Source:
     """Return a model by its file. Raises `RobotError`, one line, where nothing can be made of
-    it."""
+    it.
+    """
     root = ModelReader(path).root
     if root.tag == "mujoco":
         source = Source(path, load_spec(path), {})
@@ -127,7 +129,8 @@ def _check_tree(path: Path, root: ElementTree.Element) -> None:
 
 def _find_shapes(path: Path, root: ElementTree.Element) -> list[str]:
     """Give each link of a URDF its shapes for planning; return what to tell the user of them.
-    Raises `RobotError`."""
+    Raises `RobotError`.
+    """
     own = root.find("mujoco/compiler")
     folder = "." if own is None else own.get("meshdir", ".")
     links = {link.get("name", ""): link for link in root.findall("link")}

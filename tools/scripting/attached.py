@@ -86,7 +86,8 @@ class AttachedRack:
     @as_failure()
     def __getitem__(self, name: str) -> Any:
         """Return the newest value of a signal, as in `servo.status.position`: an array or a number;
-        a state by its name."""
+        a state by its name.
+        """
         signal = Signal.of(name, self._boxes)
         reading = self.read(signal.mailbox)
         if not reading.is_there:
@@ -96,7 +97,8 @@ class AttachedRack:
     @as_failure()
     def command(self, level: str, what: str, wait_s: float | None = None, **goal: Any) -> Reply:
         """Command a level, as in `command("servo", "setpoint", joints=(...), wait_s=10)`; return
-        its reply once it has taken the command up, with `wait_s` once it is done, in that time."""
+        its reply once it has taken the command up, with `wait_s` once it is done, in that time.
+        """
         plain = {key: v.tolist() if isinstance(v, np.ndarray) else v for key, v in goal.items()}
         given = {"level": level, "what": what, **plain}
         return _accepted(self._desk.give(given, wait_s is not None, wait_s))
@@ -136,7 +138,8 @@ class AttachedRack:
     @as_failure()
     def wait_until(self, condition: str, timeout_s: float) -> int:
         """Wait until a condition holds, as in `servo.status.position[2] > 1.2`; return the tick of
-        the first message in which it does, the newest one or a later one."""
+        the first message in which it does, the newest one or a later one.
+        """
         trigger = Trigger.of(condition, self._boxes)
         tap = SignalTap(self._segment, [trigger.signal])
         newest = slice(-1, None)
@@ -152,7 +155,8 @@ class AttachedRack:
     def wait_for(self, event: str, timeout_s: float) -> Event:
         """Wait for an event since the rack was attached, by kind or code, as in `detection` or
         `rejoined`; each is returned once. Those of a rack that misses many cycles are overwritten
-        if nothing waits for seconds; `Rack.events` has all."""
+        if nothing waits for seconds; `Rack.events` has all.
+        """
         for _ in self._looks(timeout_s):
             self._events += [rung.event for rung in self._alarms.drain()]
             for found in self._events:
@@ -179,7 +183,8 @@ class AttachedRack:
     @as_failure()
     def record(self, folder: str | Path | None = None) -> Path:
         """Record the rack, from the two seconds that its rings still hold until this is closed;
-        return the folder, by default runs/<rack>-<time>."""
+        return the folder, by default runs/<rack>-<time>.
+        """
         wanted = None if folder is None else Path(folder)
         path = folder_of(wanted, self._segment.rack)
         path.mkdir(parents=True, exist_ok=True)

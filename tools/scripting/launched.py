@@ -81,7 +81,8 @@ class LaunchedRack(CrateRack):
 
     def launch(self) -> None:
         """Power on every board except the clock, and wait until all have passed their self-tests;
-        begin to record. Raises as `rack.boards.Rack.launch` does, and `Failure` for `out`."""
+        begin to record. Raises as `rack.boards.Rack.launch` does, and `Failure` for `out`.
+        """
         if self.folder is not None:
             self._record = RunRecord(self.folder)
         super().launch()
@@ -94,7 +95,8 @@ class LaunchedRack(CrateRack):
 
     def watch(self, timeout_s: float) -> bool:
         """Supervise the boards for `timeout_s` or until the run is over; return False when it is
-        over. Raises `Failure` when its recording cannot be written."""
+        over. Raises `Failure` when its recording cannot be written.
+        """
         is_running = super().watch(timeout_s)
         if self._record is not None:
             self._record.look()
@@ -117,7 +119,8 @@ Rack = LaunchedRack
 
 class RunRecord:
     """The recording of a run: its events, and the recorder's process, which imports its libraries
-    while the boards start."""
+    while the boards start.
+    """
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder

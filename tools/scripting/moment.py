@@ -1,5 +1,6 @@
 """A recorded run at a tick, for a Python program: what was in force, the levels, and a rack that
-goes on from there."""
+goes on from there.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +49,8 @@ class RecordedMoment:
 
     def __getitem__(self, name: str) -> Any:
         """Return the value of a signal, as in `servo.status.position`: an array or a number; a
-        state by its name."""
+        state by its name.
+        """
         signal = Signal.of(name, self._recording.layout.timed)
         return signal.in_message(self.read(signal.mailbox).record)
 
@@ -64,7 +66,8 @@ class RecordedMoment:
 
     def levels(self, anyway: bool = False) -> dict[str, Document]:
         """Return the attributes of the levels' own objects, by task, in plain data; `anyway`: even
-        if the code or the files of the run have changed since."""
+        if the code or the files of the run have changed since.
+        """
         with as_failure(), RunAgain(self._recording, anyway=anyway) as again:
             return again.levels(self.tick)
 

@@ -61,7 +61,8 @@ class RecordedRun:
     @cached_property
     def report(self) -> Document:
         """The report, as in report.json, which is written if it is missing or older than the
-        run."""
+        run.
+        """
         return newest_report(self.folder)[0]
 
     def to_pandas(self, mailbox: str) -> DataFrame:
@@ -127,7 +128,8 @@ class RecordedSignal:
 
     def to_pandas(self) -> DataFrame:
         """Return a table with a row a message, by time_s: the tick, and a column a number; states
-        by name. Raises `Failure` without pandas."""
+        by name. Raises `Failure` without pandas.
+        """
         return _table([self])
 
     def plot(self, axes: Axes | None = None) -> Axes:

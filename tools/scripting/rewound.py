@@ -42,7 +42,8 @@ class Glance:
 
 class RewoundRun:
     """A run, and the `tick` at which one looks at it. Use it as a context: it repeats the run, and
-    keeps snapshots of it."""
+    keeps snapshots of it.
+    """
 
     def __init__(self, folder: Path, anyway: bool = False) -> None:
         self._anyway = anyway
@@ -93,7 +94,8 @@ class RewoundRun:
 
     def goto_when(self, condition: str, back: bool = False) -> Glance:
         """Go to the next tick at which readers find that a condition has begun to hold, or to the
-        one before. Raises `Failure` where there is none."""
+        one before. Raises `Failure` where there is none.
+        """
         found = self._in_force.begins(Trigger.of(condition, self._layout.timed))
         before = found[(found >= self._first) & (found < self.tick)][-1:]
         after = found[(found > self.tick) & (found < self._end)][:1]
@@ -116,7 +118,8 @@ class RewoundRun:
 
     def show(self, name: str) -> Glance:
         """Return a level's own attributes, the message in force in a mailbox, or a signal in it.
-        Raises `Failure` with the nearest names."""
+        Raises `Failure` with the nearest names.
+        """
         whole = name.partition("[")[0]
         if name in self._tasks:
             return self._level(name)
@@ -165,7 +168,8 @@ class RewoundRun:
         display: Display,
     ) -> Glance:
         """Let the rack go on from this tick, with other settings or faults, and record it; as long
-        as the run where that was given a time. Raises `Failure`, `ConfigError`."""
+        as the run where that was given a time. Raises `Failure`, `ConfigError`.
+        """
         config = branched(self.recording, settings, faults)
         ended = self.recording.ended.get("outcome", {})
         if seconds is None and ended.get("cause") == "time over":

@@ -1,5 +1,6 @@
 """Inventory of a config: tasks, mailboxes with their bus addresses, host side, network, and what an
-arm does without torques."""
+arm does without torques.
+"""
 
 from __future__ import annotations
 
@@ -94,7 +95,8 @@ def inventory(config: RackConfig, layout: Layout, notes: list[str]) -> Document:
 
 def _patience(config: RackConfig, layout: Layout) -> Iterator[Document]:
     """Yield how long an arm, or hand, goes on without a new torque, and what it does meanwhile,
-    joint by joint."""
+    joint by joint.
+    """
     for board in [box.writer for box in layout.mailboxes if box.message == "arm_state"]:
         cell = built_cell(config)
         every = config.every(board)
@@ -210,7 +212,8 @@ def inventory_blocks(found: Document) -> Blocks:
 
 def _host_blocks(hosts: Sequence[Document]) -> Blocks:
     """Yield the boards of the host side: they have no rate, and the timing model leaves them
-    out."""
+    out.
+    """
     if hosts:
         rows = [
             {

@@ -1,5 +1,6 @@
 """A config judged by the timing model, and a change of one of its boards, judged on the whole
-rack."""
+rack.
+"""
 
 from __future__ import annotations
 
@@ -56,7 +57,8 @@ class JudgedConfig:
 
     def change(self, board: str, settings: Settings) -> Change | None:
         """Return the change to other settings of a board, with the config loaded anew and judged;
-        None if that is invalid."""
+        None if that is invalid.
+        """
         config = self.config
         table = config.board[board]
         boards = {**config.board, board: table.model_copy(update=dict(settings))}
@@ -82,7 +84,8 @@ class JudgedConfig:
 
     def failing_of(self, board: str) -> set[tuple[str, str, str]]:
         """Return the keys of the failures of a board's own tasks; without any, of overloads of its
-        cores."""
+        cores.
+        """
         names = {board, f"{board}.planner"}
         own = {verdict.key for verdict in self.failing if verdict.subject in names}
         cores = {f"core {core}" for core in self.timing.cores_of(board)}
@@ -90,7 +93,8 @@ class JudgedConfig:
 
     def cures(self, board: str, before: JudgedConfig) -> bool:
         """Return whether all failures of the board in `before` are gone, and no new ones have
-        appeared."""
+        appeared.
+        """
         failing = {verdict.key for verdict in self.failing}
         old = {verdict.key for verdict in before.failing}
         return failing < old and not failing & before.failing_of(board)

@@ -139,7 +139,8 @@ def _along(
 
 def _delays(recording: Recording, levels: Sequence[str], since: int, until: int) -> Iterator[str]:
     """Yield the faults, losses and misses between two ticks of the levels that the information
-    passes."""
+    passes.
+    """
     for fault in recording.ended.get("faults", ()):
         if 0 <= fault["began"] < until and not 0 <= fault["ends"] <= since:
             yield f"fault: {fault['kind']} of {fault['board']}"

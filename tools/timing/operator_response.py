@@ -71,7 +71,8 @@ class AnsweredCommand:
 @dataclass(frozen=True)
 class OperatorResponse:
     """The response of a run. `tick_ms` is simulated time; `paths` are by level, for every level
-    that was commanded."""
+    that was commanded.
+    """
 
     tick_ms: float
     lockstep: bool
@@ -91,7 +92,8 @@ class OperatorResponse:
     @property
     def beyond(self) -> list[AnsweredCommand]:
         """The commands whose response exceeded a bound: the longest on the grid, or eq. 3.2 from
-        the release on."""
+        the release on.
+        """
         return [command for command in self.measured if self._is_beyond(command)]
 
     def _is_beyond(self, command: AnsweredCommand) -> bool:
@@ -109,12 +111,14 @@ class OperatorResponse:
     @property
     def held(self) -> bool:
         """Whether no response exceeded a bound and, in lockstep, each came at the predicted
-        tick."""
+        tick.
+        """
         return not self.beyond and not (self.lockstep and self.off)
 
     def rows(self) -> list[Document]:
         """Return the figures of every level that was commanded, ms of simulated time, as plain
-        data."""
+        data.
+        """
         return [self._row(level, path) for level, path in self.paths.items()]
 
     def _row(self, level: str, path: CommandPath) -> Document:
@@ -206,7 +210,8 @@ def _answered(
     recording: Recording, level: str, path: CommandPath, lockstep: bool
 ) -> Iterator[AnsweredCommand]:
     """Yield the commands given to a level, each with the first cycle of the lowest level that rests
-    on it, if any."""
+    on it, if any.
+    """
     box = f"{level}.operator"
     # A clock that died while giving a command has given it twice: the first one counts.
     serials, at = np.unique(recording.signal(box, "id"), return_index=True)
@@ -273,7 +278,8 @@ def show(recording: Recording, folder: Path, as_json: bool) -> bool:
 
 def plot(response: OperatorResponse, folder: Path) -> list[Path]:
     """Write response.png and response.svg, a histogram per level with its bounds, into `folder`;
-    return their paths."""
+    return their paths.
+    """
     levels = [level for level in response.paths if any(c.level == level for c in response.measured)]
     paths = paths_of(folder / "response")
     with picture(paths, 8.0, 0.8 + 1.7 * len(levels), layout="constrained") as figure:

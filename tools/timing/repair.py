@@ -78,7 +78,8 @@ class Repair:
 
 def repair(rack: JudgedConfig) -> Repair:
     """Return the changes that make a rack fit: for one board, then, with the cheapest of them, for
-    the next."""
+    the next.
+    """
     steps: list[tuple[Change, ...]] = []
     while rack.failing:
         found = next(
@@ -139,7 +140,8 @@ def _own_changes(rack: JudgedConfig, board: str) -> Iterator[Change]:
 
 def _priorities(rack: JudgedConfig, board: str) -> Iterator[Settings]:
     """Yield the priorities of a board's executor, or its planner, above other tasks on its core,
-    the smallest rise first."""
+    the smallest rise first.
+    """
     table = rack.config.board[board]
     limit = rack.config.clock.priority or HIGHEST + 1
     for key, task in (("priority", board), ("planner_priority", f"{board}.planner")):
@@ -155,7 +157,8 @@ def _priorities(rack: JudgedConfig, board: str) -> Iterator[Settings]:
 
 def _changes_of_others(rack: JudgedConfig, board: str) -> Iterator[Change]:
     """Yield the cheapest change of each board that shares a core with this one: another core, of
-    the board or of its loose planner alone, or a longer cycle."""
+    the board or of its loose planner alone, or a longer cycle.
+    """
     timing = rack.timing
     cores = timing.cores_of(board)
     loads = {task.board: 0.0 for task in timing.tasks}
@@ -183,7 +186,8 @@ def _cheapest(changes: Iterable[Change | None]) -> Change | None:
 
 def _longer_cycles(rack: JudgedConfig, board: str, place: Settings | None = None) -> list[Settings]:
     """Return longer cycles of a board, its planner in another place if one is given; with a limit
-    on the age of plans, a plan may then get fewer cycles."""
+    on the age of plans, a plan may then get fewer cycles.
+    """
     every = rack.timing.boards[board].every
     timing = rack.timing if place is None else rack.timing.changed(board, coupling="loose")
     level = timing.level(board)
@@ -205,7 +209,8 @@ def _longer_cycles(rack: JudgedConfig, board: str, place: Settings | None = None
 
 def _places(rack: JudgedConfig, board: str) -> Iterator[Settings]:
     """Yield settings for each place where the board's planner could be loosely coupled; none
-    without a planner."""
+    without a planner.
+    """
     slot = rack.config.board[board].planner_slot
     if slot is None:
         tables = rack.config.board.values()
@@ -219,7 +224,8 @@ def _places(rack: JudgedConfig, board: str) -> Iterator[Settings]:
 
 def _cycles(level: LevelTiming) -> range:
     """Return the longer times, in cycles, that a plan of a level may take; none without a
-    planner."""
+    planner.
+    """
     if level.within_cycles is None:
         return range(0)
     longest = min(level.within_cycles * MAX_FACTOR, MAX_CYCLES)

@@ -1,5 +1,6 @@
 """What a check says first: does the rack fit, where is it tightest, how soon does it respond, what
-can its arm do, and what to do about it."""
+can its arm do, and what to do about it.
+"""
 
 from __future__ import annotations
 
@@ -87,7 +88,8 @@ def _verdict(forecast: Forecast, measuring: str) -> Iterator[str]:
 
 def tightest(verdicts: Sequence[EquationVerdict]) -> Iterator[str]:
     """Yield the verdict with the least part of its right side left; an equality has no margin, and
-    the system's response is exact."""
+    the system's response is exact.
+    """
     bounds = [
         found
         for found in verdicts

@@ -1,5 +1,6 @@
 """A forecast as text: the system's response, and tables of levels, verdicts and response times;
-times in ms."""
+times in ms.
+"""
 
 from __future__ import annotations
 
@@ -89,7 +90,8 @@ def _schedule_blocks(forecast: Forecast) -> Blocks:
 
 def _numbers(frames: Sequence[int], count: int) -> str:
     """Return the numbers of frames as text, those at equal distances by the first two and the
-    last."""
+    last.
+    """
     if len(frames) == count:
         return "all"
     if len(frames) <= 3:
@@ -131,7 +133,8 @@ def level_table(levels: Iterable[tuple[str, LevelTiming]], about: str) -> TextTa
 
 def verdict_table(verdicts: Iterable[tuple[str, EquationVerdict]]) -> TextTable:
     """Return a line per verdict: both sides, the margin, whether it holds. Each comes with the side
-    that it is of, predicted or measured; "": the table needs none."""
+    that it is of, predicted or measured; "": the table needs none.
+    """
     rows: Iterable[Row] = (
         {
             "eq.": verdict.equation,
@@ -199,7 +202,8 @@ def _inbox_table(inboxes: Iterable[Mapping[str, Any]]) -> TextTable:
 
 def merge_rows(rows: Iterable[Mapping[str, Any]], name: str) -> list[dict[str, Any]]:
     """Return the rows, those that differ only in the column `name` as one: a board a joint fills no
-    page."""
+    page.
+    """
     names: dict[tuple[tuple[str, Any], ...], list[str]] = {}
     for row in rows:
         names.setdefault(tuple({**row, name: ""}.items()), []).append(str(row[name]))

@@ -1,5 +1,6 @@
 """The first view of one run or several: the blueprint of all views, the place of the eye, the
-config as a document."""
+config as a document.
+"""
 
 from __future__ import annotations
 
@@ -73,13 +74,15 @@ def blueprint(root: rrb.Container, live: bool = False) -> rrb.Blueprint:
 
 def together(racks: Mapping[str, RackViews]) -> rrb.Container:
     """Return the view of several racks, by name: all at once above the log of all, and in further
-    tabs each by itself."""
+    tabs each by itself.
+    """
     return _all_and_each(racks, "all racks", _log(racks, "racks"), [4, 1])
 
 
 def side_by_side(runs: Mapping[str, RackViews]) -> rrb.Container:
     """Return the view of two runs of one rack, by name: as of several racks, and the curves of both
-    in the same plots, those of the first run in grey."""
+    in the same plots, those of the first run in grey.
+    """
     first, other = runs.values()
     names = "{} in grey, {} in colour".format(*runs)
     both = zip(first.main_curves().items(), other.main_curves().values(), strict=True)
@@ -95,7 +98,8 @@ def _all_and_each(
     racks: Mapping[str, RackViews], name: str, below: rrb.Container | rrb.View, shares: list[float]
 ) -> rrb.Container:
     """Return a column for each rack, its cell above what its levels do, and `below` them something
-    of all; in further tabs each rack by itself."""
+    of all; in further tabs each rack by itself.
+    """
     columns = rrb.Horizontal(*(views.column(rack) for rack, views in racks.items()))
     shown = rrb.Vertical(columns, below, row_shares=shares, name=name)
     return rrb.Tabs(shown, *(views.everything(rack) for rack, views in racks.items()), active_tab=0)
@@ -162,7 +166,8 @@ class RackViews:
 
     def main_curves(self) -> dict[str, list[str]]:
         """Return the entities whose curves show what a run did, by the title of a plot: those of
-        the arm or, without one, all signals."""
+        the arm or, without one, all signals.
+        """
         if not self._joints:
             boxes = self._layout.mailboxes
             fields = [(box.name, field.name) for box in boxes for field in box.fields]
@@ -192,7 +197,8 @@ class RackViews:
 
     def _arm(self) -> rrb.Container:
         """Return a view of all joints for each quantity, and in a second tab one of each joint with
-        its limits."""
+        its limits.
+        """
         error, *together = (_curves(*curves) for curves in self.main_curves().items())
         views = [
             rrb.Tabs(
@@ -210,7 +216,8 @@ class RackViews:
 
     def _requests(self) -> list[rrb.Container]:
         """Return the queue of a level that follows motion requests, and its error at a goal that
-        moves."""
+        moves.
+        """
         return [
             rrb.Horizontal(
                 _curves("taken and done", self._fields(box, "taken", "done")),
@@ -257,7 +264,8 @@ class RackViews:
 
     def _fingers(self, hand: Hand) -> rrb.Container:
         """Return a view of every finger for tensions, joints and forces, each kind in a tab, and
-        one of all tips."""
+        one of all tips.
+        """
         tabs = [
             rrb.Grid(
                 *(
@@ -345,7 +353,8 @@ def _curves(
 
 def grid_on(cell: Cell) -> rrb.LineGrid3D:
     """Return a grid on the floor of a cell; without a floor, at the height of the world's
-    origin."""
+    origin.
+    """
     plane = rr.components.Plane3D((0.0, 0.0, 1.0), floor_of(cell) + ABOVE_M)
     return rrb.LineGrid3D(visible=True, plane=plane, spacing=GRID_M, color=GRID)
 

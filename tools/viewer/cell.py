@@ -1,5 +1,6 @@
 """The cell in 3D: its geoms, each once, in the frame of its body; poses of moving bodies; pushes;
-path and goals."""
+path and goals.
+"""
 
 from __future__ import annotations
 
@@ -69,7 +70,8 @@ def moving_bodies(model: mujoco.MjModel) -> Ints:
 
 def write_geometry(stream: Stream, cell: Cell) -> None:
     """Log all geoms, the frames that never move with their poses at the start, and directions
-    of the world's axes."""
+    of the world's axes.
+    """
     model = cell.model
     data = cell.start()
     stream.static((CELL,), stream.within(WORLD))
@@ -108,7 +110,8 @@ def write_geometry(stream: Stream, cell: Cell) -> None:
 
 class Poses:
     """Writes an `ArmState` as poses of all moving bodies, by MuJoCo's own kinematics, the path of
-    the tool, and, with `has_pushes`, the forces that the scene exerts on its objects."""
+    the tool, and, with `has_pushes`, the forces that the scene exerts on its objects.
+    """
 
     def __init__(self, stream: Stream, cell: Cell, has_pushes: bool) -> None:
         self._stream = stream
@@ -176,7 +179,8 @@ class Poses:
 
 class Marks:
     """Marks in red what stops the arm: joints whose brakes are engaged, and faults while they
-    act."""
+    act.
+    """
 
     def __init__(self, stream: Stream, cell: Cell, joints: Sequence[str]) -> None:
         self._stream = stream
@@ -200,7 +204,8 @@ class Marks:
 
     def fault(self, when: Moment, event: Event) -> None:
         """Mark the joint of a fault that begins, or the first joint for one of no joint, until it
-        ends."""
+        ends.
+        """
         joint = event.subject if event.subject in self._joints else next(iter(self._joints))
         if event.code == "begins":
             text = event.text.partition(" begins")[0]
@@ -242,7 +247,8 @@ def floor_of(cell: Cell) -> float:
 
 def planned_path(stream: Stream, cell: Cell) -> ViewPart:
     """Return the part that writes a `MovePlan` as a line of the tool point with its way points,
-    from the tick at which they are visible; a plan for the gripper clears the path."""
+    from the tick at which they are visible; a plan for the gripper clears the path.
+    """
     data = cell.start()
     for entity in (PATH, WAYPOINTS):
         stream.static(entity, stream.within(WORLD))
@@ -278,7 +284,8 @@ def in_pieces(corners: Array) -> Array:
 
 class Goals:
     """Writes the places where a `TaskPlan` puts its objects down, and the goal of the current
-    move."""
+    move.
+    """
 
     def __init__(self, stream: Stream, objects: Sequence[str]) -> None:
         self._stream = stream

@@ -45,7 +45,8 @@ def joint_curves(
     stream: Stream, names: Sequence[str], cell: Cell, has_gripper: bool
 ) -> Iterator[ViewPart]:
     """Yield the parts that write the status of what drives the arm: each joint as measured and as
-    commanded, with its limits, tracking error and gripper."""
+    commanded, with its limits, tracking error and gripper.
+    """
     colours = of_joints(len(names))
     write_legend(stream, JOINTS, names, colours)
     bounds = cell.bounds
@@ -91,7 +92,8 @@ def joint_curves(
 
 def _limits(stream: Stream, entity: Sequence[str], limits: Array) -> ViewPart:
     """Return the part that writes the limits of a quantity, (2,): straight lines need only their
-    ends."""
+    ends.
+    """
     style_curves(stream, entity, ["lower limit", "upper limit"], [LIMIT, LIMIT], [1.0, 1.0])
     return lambda block: stream.scalars(entity, block.times_of([0, -1]), np.tile(limits, (2, 1)))
 
@@ -110,7 +112,8 @@ def gripper_units(cell: Cell) -> tuple[str, str]:
 
 def field_curves(stream: Stream, mailbox: MailboxSpec) -> Iterator[ViewPart]:
     """Yield the parts that write the numeric fields of a mailbox: a user's own messages show
-    without any configuration."""
+    without any configuration.
+    """
     for field in mailbox.fields:
         if field.fields or field.kind[1] not in "iufb" or not 0 < prod(field.shape) <= MAX_CURVES:
             continue

@@ -99,7 +99,8 @@ class Events:
 
 def row_losses(stream: Stream) -> Callable[[int, Mapping[str, int]], None]:
     """Return a function that writes, at a tick, how many rows by ring were overwritten before the
-    recorder took them; it logs every loss."""
+    recorder took them; it logs every loss.
+    """
     entity = (RECORDER, "rows_lost")
     style_curves(stream, entity, ["rows lost"], [LOST])
     logged = Counter[str]()
@@ -118,7 +119,8 @@ def row_losses(stream: Stream) -> Callable[[int, Mapping[str, int]], None]:
 
 def recorder_load(stream: Stream) -> Callable[[int], None]:
     """Return a function that writes, at a tick, the load of this process, a recorder, since its
-    last call."""
+    last call.
+    """
     entity = (RECORDER, "load")
     style_curves(stream, entity, ["recorder, % of a core"])
     last = time.process_time(), time.monotonic()

@@ -1,5 +1,6 @@
 """Forces of contacts: an arrow at each place where they are sensed, and curves of what is wanted
-and exerted."""
+and exerted.
+"""
 
 from __future__ import annotations
 
@@ -58,7 +59,8 @@ class ContactPlace(NamedTuple):
 
 def contacts_of(cell: Cell) -> list[ContactPlace]:
     """Return the places where a cell's forces are sensed: the tool on a wrist sensor, the tips of a
-    hand."""
+    hand.
+    """
     if cell.hand is not None:
         tips = zip(cell.hand.names, cell.hand.tips, strict=True)
         return [ContactPlace(name, int(tip), cell.tool) for name, tip in tips]
@@ -67,7 +69,8 @@ def contacts_of(cell: Cell) -> list[ContactPlace]:
 
 def contact_arrows(stream: Stream, cell: Cell, field: str) -> ViewPart:
     """Return the part that writes the forces of the surroundings on tool or fingertips as arrows,
-    one every 20 ms of simulated time; the numbers of `field` begin with three for each place."""
+    one every 20 ms of simulated time; the numbers of `field` begin with three for each place.
+    """
     scale, shaft = TIP_M, TIP_SHAFT_M
     if cell.wrist is not None:
         scale, shaft = LONGEST_M / cell.wrist.most[0], TOOL_SHAFT_M
@@ -92,7 +95,8 @@ def contact_arrows(stream: Stream, cell: Cell, field: str) -> ViewPart:
 
 def task_forces(stream: Stream) -> Iterator[ViewPart]:
     """Yield the parts that write a `ForceStatus`: what the tool exerts along each axis of the task
-    frame, and what is wanted of it."""
+    frame, and what is wanted of it.
+    """
     for at, (axis, unit) in enumerate(AXES.items()):
         names = [f"{axis} wanted, {unit}", f"{axis} exerted, {unit}"]
         values = partial(_wanted_and_exerted, at)
@@ -110,7 +114,8 @@ def _wanted_and_exerted(at: int, block: RowBlock) -> Array:
 
 def contact_forces(stream: Stream, most: tuple[float, float]) -> Iterator[ViewPart]:
     """Yield the parts that write a `Wrench` as the size of force and torque, with the arm's
-    limits, `most`."""
+    limits, `most`.
+    """
     for at, (what, unit) in enumerate(CONTACT_UNITS.items()):
         names = [f"limit, {unit}", f"{what} of the contact, {unit}"]
         values = partial(_limit_and_size, most[at], 3 * at)

@@ -37,7 +37,8 @@ def _finger_curves(
     stream: Stream, names: Sequence[str], finger: str, at: int, joints: Ints
 ) -> Iterator[ViewPart]:
     """Yield the parts for a finger's joints, its tensions as sensed and as commanded, and the force
-    on its tip."""
+    on its tip.
+    """
     own = [names[joint] for joint in joints]
     colours = of_joints(len(own))
     yield curves(

@@ -1,5 +1,6 @@
 """The levels: state, command and move of each as lanes, errors as log lines, and all of them as a
-graph."""
+graph.
+"""
 
 from __future__ import annotations
 
@@ -97,7 +98,8 @@ def activity(stream: Stream, mailbox: MailboxSpec) -> Iterator[ViewPart]:
 
 def fired_rows(stream: Stream, mailbox: MailboxSpec) -> ViewPart:
     """Return the part that writes which row of a state table fires, as a lane, and every change to
-    the log."""
+    the log.
+    """
     board = mailbox.name.partition(".")[0]
     changed_rows = change_finder()
 

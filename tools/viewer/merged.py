@@ -1,5 +1,6 @@
 """Recorded runs of several racks as one recording for the viewer: each below its name, all on one
-time line."""
+time line.
+"""
 
 from __future__ import annotations
 

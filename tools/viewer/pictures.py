@@ -1,5 +1,6 @@
 """Pictures of a recording without a screen: `python -m rack.tools.viewer.pictures RUN/run.rrd
-OUT.png --at 7.5`."""
+OUT.png --at 7.5`.
+"""
 
 from __future__ import annotations
 
@@ -98,7 +99,8 @@ class Screen:
 @contextmanager
 def opened(recording: Path) -> Iterator[Screen]:
     """Open a recording in a headless viewer. Raises `NoViewerError` where the machine lacks the
-    graphics libraries."""
+    graphics libraries.
+    """
     port = free_port()
     # Not by `ViewerClient.spawn`: that viewer would listen on every network.
     window = ViewerWindow(headless=True, port=port)

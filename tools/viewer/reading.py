@@ -14,7 +14,8 @@ from rack.tools.viewer.stream import TICK
 
 class Rows(NamedTuple):
     """Rows of one entity in the order of ticks: `ticks` (rows,), `values` one list or array a
-    row."""
+    row.
+    """
 
     ticks: np.ndarray
     values: np.ndarray
@@ -22,7 +23,8 @@ class Rows(NamedTuple):
 
 def read(file: Path, entity: str, component: str = "Scalars:scalars") -> Rows:
     """Return one component of an entity, from a file and the parts that continue it; curves are
-    (rows, curves). Raises `KeyError` when they have none."""
+    (rows, curves). Raises `KeyError` when they have none.
+    """
     chunks = [
         chunk
         for part in parts_of(file)

@@ -1,5 +1,6 @@
 """The recorder's rows as a recording for the viewer: taken as they are drained, written in
-blocks."""
+blocks.
+"""
 
 from __future__ import annotations
 
@@ -83,7 +84,8 @@ the NASREM rack."""
 
 class Ran(NamedTuple):
     """What a view needs to know of a rack before its first row: its layout, its config, its cell,
-    its event log."""
+    its event log.
+    """
 
     layout: Layout
     text: str
@@ -152,7 +154,8 @@ class RackWriter:
 
     def write(self, taken: Mapping[str, np.ndarray], tick: int, lost: Mapping[str, int]) -> None:
         """Write the rows of all rings, each (rows,), by ring: everything before `tick`. `lost`
-        counts rows by ring."""
+        counts rows by ring.
+        """
         if (fastest := taken.get(self._fastest)) is not None:
             self._times.learn(fastest["tick"], fastest["start_ns"])
         for ring, rows in taken.items():
@@ -240,7 +243,8 @@ def block_of(layout: Layout) -> int:
 
 def _of_any(stream: Stream, mailbox: MailboxSpec) -> Iterator[ViewPart]:
     """Yield the parts of the view for a mailbox, by its message type, so that any rack has a
-    view."""
+    view.
+    """
     names = {field.name for field in mailbox.fields}
     board, _, port = mailbox.name.partition(".")
     kind = mailbox.message

@@ -65,7 +65,8 @@ class Timelines:
 
     def times(self, ticks: Ints, stamps_ns: Ints, within_ns: Ints | int = 0) -> RowTimes:
         """Return the times of rows released at `ticks`, `within_ns` of simulated time later,
-        stamped `stamps_ns`."""
+        stamped `stamps_ns`.
+        """
         if (placed := self._placed) is None:
             return RowTimes(ticks * self.clock_ns + within_ns, ticks, stamps_ns + self._offset_ns)
         released = placed.times_ns(ticks, 0) // placed.line.clock_ns
@@ -148,7 +149,8 @@ ViewPart = Callable[[RowBlock], None]
 
 def change_finder() -> Callable[[np.ndarray], Ints]:
     """Return a function that takes the values of consecutive blocks, (rows,) or structured, and
-    returns the indices of the rows that differ from the row before."""
+    returns the indices of the rows that differ from the row before.
+    """
     last: np.ndarray | None = None
 
     def changed_rows(values: np.ndarray) -> Ints:
@@ -167,7 +169,8 @@ SHOWN_S = 0.02
 
 def row_sampler(clock_ns: int) -> Callable[[Ints], Ints]:
     """Return a function that takes the ticks of consecutive blocks, and returns the indices of the
-    rows that are drawn: the first of every 20 ms of simulated time."""
+    rows that are drawn: the first of every 20 ms of simulated time.
+    """
     every = max(1, round(SHOWN_S * 1e9 / clock_ns))
     last = -1
 
@@ -220,7 +223,8 @@ class Stream:
 
     def frame(self, name: str) -> str:
         """Return the name of a coordinate frame: frames are known to all entities of a
-        recording."""
+        recording.
+        """
         return "/".join((*self._root, name))
 
     def within(self, frame: str) -> rr.CoordinateFrame:
@@ -258,7 +262,8 @@ class Stream:
 
     def say(self, when: Moment, source: str, text: str, level: str) -> None:
         """Write a line to the log, under its source; of a rack among several it begins with the
-        rack's name."""
+        rack's name.
+        """
         line = rr.TextLog(": ".join((*self._root, text)), level=level)
         self.at(when, (LOG, source), line)
 

@@ -98,7 +98,8 @@ def dimmed(colour: Colour) -> Colour:
 
 def packed(colours: Iterable[Colour]) -> np.ndarray:
     """Return colours as rerun takes any number of them: three or four plain numbers are one colour
-    to it."""
+    to it.
+    """
     return np.array(list(colours), np.uint32)
 
 
@@ -127,7 +128,8 @@ def style_curves(
     widths: Sequence[float] | None = None,
 ) -> None:
     """Set names, colours and widths of an entity's curves; without colours the viewer picks
-    them."""
+    them.
+    """
     shades = None if colours is None else packed(colours)
     stream.static(entity, rr.SeriesLines(names=names, colors=shades, widths=widths))
 
@@ -183,7 +185,8 @@ def write_span(stream: Stream, when: Moment, entity: Sequence[str], state: str) 
 
 def lanes_view(name: str, contents: Sequence[str], around_s: float | None = None) -> rrb.View:
     """Return a view of lanes: of the whole run, or of `around_s` before and after the time
-    cursor."""
+    cursor.
+    """
     axis = rrb.TimeAxis(link="LinkToGlobal")
     if around_s is not None:
         begin, end = (

@@ -1,5 +1,6 @@
 """The timing of a rack in the view: lanes and curves of every task, from its trace, and the ages of
-messages."""
+messages.
+"""
 
 from __future__ import annotations
 
@@ -116,7 +117,8 @@ def load_curves(
 
 def missed_cycles(stream: Stream, task: TaskSpec) -> ViewPart:
     """Return the part that writes missed cycles: as a lane that shows them at any zoom, and as one
-    log line a block. A task that never misses has no lane."""
+    log line a block. A task that never misses has no lane.
+    """
     lane = (LEVELS, task.board, f"{task.role}_{MISSED}")
     span = max(1, round(SPAN_S * 1e9 / stream.times.clock_ns))
 
@@ -141,7 +143,8 @@ def missed_cycles(stream: Stream, task: TaskSpec) -> ViewPart:
 
 class Age:
     """Writes, at every release of a mailbox's fastest reader, the age in ms of the message that is
-    visible then."""
+    visible then.
+    """
 
     def __init__(
         self, stream: Stream, mailbox: MailboxSpec, layout: Layout, colour: Colour
@@ -170,7 +173,8 @@ class Age:
 
     def advance(self, tick: int) -> None:
         """Write the ages at all releases before `tick`; every message visible before it has been
-        taken."""
+        taken.
+        """
         releases = np.arange(self._releases.since(self._upto + 1), tick, self._releases.every)
         self._upto = max(self._upto, tick - 1)
         newest = newest_visible(releases, self._visible_at)

@@ -1,5 +1,6 @@
 """The viewer's window: a separate process, which may be closed at any time and outlives the command
-that opened it."""
+that opened it.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
 """Boards and host boards: names, neighbours, planners and slots; their rates, the clock, and a
-static schedule."""
+static schedule.
+"""
 
 from __future__ import annotations
 
@@ -130,7 +131,8 @@ def circles(wiring: Wiring) -> Mistakes:
 
 def _named_by(config: RackConfig, upper: str, lower: str) -> list[tuple[str, str, str]]:
     """Return board and key of every table that puts one board above another, and the end of a
-    hierarchy without it."""
+    hierarchy without it.
+    """
     tables = ((upper, "below", "lowest", lower), (lower, "above", "highest", upper))
     return [
         (board, key, end)
@@ -197,7 +199,8 @@ def clock(wiring: Wiring) -> Mistakes:
 
 def rates(wiring: Wiring) -> Mistakes:
     """Check that the period of each board is given once, is on the clock's grid, and is not too
-    long."""
+    long.
+    """
     for name, board in wiring.config.board.items():
         place = f"board.{name}.rate_hz"
         if (board.rate_hz is None) == (board.every is None):
@@ -224,7 +227,8 @@ def rates(wiring: Wiring) -> Mistakes:
 
 def polling(wiring: Wiring) -> Mistakes:
     """Refuse a board that busy-waits on a shared core: at a real-time priority it would starve the
-    others."""
+    others.
+    """
     config = wiring.config
     cores = {CLOCK: config.clock.core} | {place.name: place.core for place in config.tasks()}
     for name, board in config.board.items():

@@ -71,7 +71,8 @@ def _board(wiring: Wiring, table: LanConfig) -> Mistakes:
 
 def _names(table: LanTable, rack: str) -> Mistakes:
     """Check names of racks and ports: none twice, none of this rack, none that the adapter itself
-    needs."""
+    needs.
+    """
     taken = {
         STATUS: "its status",
         **{peer_port(other): f"what it knows of rack '{other}'" for other in table.racks},
@@ -126,7 +127,8 @@ def _rate(place: str, entry: ExportConfig | ImportConfig, cycle_ns: int) -> Mist
 
 def _priority(config: RackConfig, table: LanConfig) -> Mistakes:
     """Require a priority above the neighbours', if there are real-time ones: else others lose sight
-    of this rack."""
+    of this rack.
+    """
     others = [place for place in config.tasks() if place.core == table.core and place.board != LAN]
     above = [
         f"{place.name} {place.priority}"
@@ -205,7 +207,8 @@ def _endpoints(table: LanTable) -> Mistakes:
 
 def _open(table: LanTable) -> list[str]:
     """Return the endpoints that others reach without a certificate: every user of this machine
-    reaches those of loopback."""
+    reaches those of loopback.
+    """
     return [str(end) for end in endpoints_of(table) if not (end.has_tls or end.is_private)]
 
 
@@ -257,7 +260,8 @@ def credential_mistakes(config: RackConfig) -> Mistakes:
 
 def network_notes(config: RackConfig) -> list[str]:
     """Return what a launch says of the network: endpoints without TLS that others can reach,
-    certificates that end."""
+    certificates that end.
+    """
     table = config.adapter.lan
     if table is None:
         return []

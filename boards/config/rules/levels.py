@@ -24,7 +24,8 @@ MAX_MODEL_BYTES = 2**30
 
 def params(wiring: Wiring) -> Mistakes:
     """Check each board's parameters against the declarations of its executor's and planner's
-    classes."""
+    classes.
+    """
     for table, kind in wiring.params:
         tables, _, board = table.partition(".")
         given = getattr(wiring.config, tables)[board].params
@@ -71,7 +72,8 @@ def memory(layout: Layout) -> Mistakes:
 
 def neighbours(wiring: Wiring, contexts: Mapping[str, LevelContext]) -> Mistakes:
     """Ask each level whether its neighbours suit it; `contexts` by board, without boards that have
-    mistakes."""
+    mistakes.
+    """
     for ports in wiring.tasks:
         board = wiring.config.board[ports.place.board]
         asked = {ports.task, *board.above, *board.below}
@@ -119,7 +121,8 @@ def robot(wiring: Wiring) -> Mistakes:
 
 def cell(wiring: Wiring) -> Mistakes:
     """Check that arm and scene fit the model. If a table of theirs has mistakes of its own, only
-    names are checked."""
+    names are checked.
+    """
     robot_table, scene_table = wiring.config.robot, wiring.config.scene
     found: list[str] = []
     if robot_table is None:

@@ -64,7 +64,8 @@ def reads(wiring: Wiring) -> Mistakes:
 
 def _wired_at(ports: TaskPorts, port: str) -> str:
     """Return the key of a config under which an input is wired, as in
-    "board.servo.reads.command"."""
+    "board.servo.reads.command".
+    """
     place = ports.place
     key = ports.kind.wired_by if issubclass(ports.kind, Adapter) else place.reads_key
     return f"{place.table}.{key}.{port}"
@@ -171,7 +172,8 @@ def exchange(wiring: Wiring) -> Mistakes:
 
 def operated(wiring: Wiring) -> Mistakes:
     """Check that only the clock writes operators' mailboxes, never waits, and never finds one
-    full."""
+    full.
+    """
     for mailbox in wiring.operated:
         if mailbox in wiring.writers:
             first = wiring.writers[mailbox][0].task
@@ -198,7 +200,8 @@ def mailboxes(wiring: Wiring) -> Mistakes:
 
 def queues(wiring: Wiring) -> Mistakes:
     """Check which mailboxes are queues, their readers and their depths, if the two sides are
-    apart."""
+    apart.
+    """
     if any(sides(wiring)):
         return
     table = wiring.config.protocol
@@ -224,7 +227,8 @@ def queues(wiring: Wiring) -> Mistakes:
 
 def _queue(wiring: Wiring, mailbox: str) -> Mistakes:
     """Check one queue: exactly one port reads it, and its reader's position has a name of its
-    own."""
+    own.
+    """
     if taken_name(mailbox) in wiring.writers:
         why = (
             f"the reader of the queue '{mailbox}' writes its position under this name; rename the"

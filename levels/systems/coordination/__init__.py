@@ -1,5 +1,6 @@
 """Task levels of several racks that work together: one that takes its actions as orders, and one
-that gives them."""
+that gives them.
+"""
 
 from rack.levels.systems.coordination.coordinator import Coordinator
 from rack.levels.systems.coordination.ordered_task import OrderedTaskExecutor, OrderedTaskPlanner

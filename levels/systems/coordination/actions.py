@@ -54,7 +54,8 @@ def copy_action(source: CellAction, target: CellAction) -> None:
 
 def read_action(message: CellAction, context: LevelContext) -> AnyAction:
     """Return the action in the `CellAction` of a message. Raises `ProgramError`: it does not
-    suit arm or scene."""
+    suit arm or scene.
+    """
     try:
         action: AnyAction = _ACTION.validate_python({**_table(message), "by": message.by or None})
     except ValidationError as error:

@@ -47,13 +47,15 @@ KEPT = ("phase", "step", "attempt", "error", "reason", "ending", "begun")
 
 class Agreement:
     """Steps through a program with several arms. `program`: its checksum; `steps`: the arms of each
-    step. The arms' answers are their `CellReport`s."""
+    step. The arms' answers are their `CellReport`s.
+    """
 
     def __init__(
         self, program: int, steps: Sequence[Collection[str]], margin_s: float, farewell_s: float
     ) -> None:
         """`margin_s`: time in which an order reaches its arm; `farewell_s`: time that the arms have
-        to confirm the end."""
+        to confirm the end.
+        """
         self.program = program
         self._steps = steps
         self._margin_s = margin_s
@@ -100,7 +102,8 @@ class Agreement:
 
     def advance(self, answers: Mapping[str, Reading[CellReport]], now_s: float) -> None:
         """Take one step forward, if the answers allow it; be over once every arm has confirmed the
-        end, or had time to."""
+        end, or had time to.
+        """
         self._answers = answers
         self._now_s = now_s
         if self.phase is Phase.AWAITING:
@@ -257,7 +260,8 @@ class TakenOrder:
 
     def hear(self, program: int, order: int, what: int, reason: str = "") -> None:
         """Follow what the newest message says of an order: an `OrderVerb`, and why a program ends
-        early."""
+        early.
+        """
         if not order or what not in TAKEN or self.response is Response.ENDED:
             return
         if what != OrderVerb.END:

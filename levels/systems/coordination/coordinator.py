@@ -1,5 +1,6 @@
 """A task level whose actions are carried out by the task levels of other racks, and its program,
-`[task]`: steps, each with what one or more arms do in it at the same time."""
+`[task]`: steps, each with what one or more arms do in it at the same time.
+"""
 
 from __future__ import annotations
 
@@ -64,7 +65,8 @@ ArmAction = Annotated[ArmTransfer | ArmGoto | ArmHome, Field(discriminator="do")
 
 class CellStep(Table):
     """`[[task.step]]`: actions that begin together, once every arm has answered that it can do its
-    own by its time."""
+    own by its time.
+    """
 
     do: tuple[ArmAction, ...]
     """actions, one for each arm that has a part in the step"""
@@ -255,7 +257,8 @@ class Coordinator(Executor):
 
     def _check_progress(self, waits: str, tick: int) -> None:
         """End the program when nothing has happened for too long, unless an operator keeps it from
-        going on."""
+        going on.
+        """
         agreement = self._agreement
         reports = [reading.message for reading in self._readings.values()]
         operated = self._operated.stands or any(report.operated for report in reports)

@@ -215,7 +215,8 @@ class OrderedTaskExecutor(TaskExecutor):
 
     def _begin(self, request: CellRequest) -> None:
         """Begin with the plan that was promised; have it planned anew if the world has changed
-        since."""
+        since.
+        """
         if not self._actions:
             self._take_action(request)
         strays = float(np.abs(self.below.message.start - request.start).max()) > MAX_STRAY_RAD

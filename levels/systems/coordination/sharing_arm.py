@@ -1,5 +1,6 @@
 """The simulated arm in a cell whose bodies other simulations may move: see
-`rack.levels.systems.coordination.shared_bodies`."""
+`rack.levels.systems.coordination.shared_bodies`.
+"""
 
 from __future__ import annotations
 

@@ -68,7 +68,8 @@ class SharingServoExecutor(ServoExecutor):
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Misfits:
         """Yield shared bodies that are no objects or named twice, besides what any servo level
-        finds."""
+        finds.
+        """
         names = context.params["shared"]
         scene = context.scene
         for name in dict.fromkeys(names):

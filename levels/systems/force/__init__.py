@@ -1,5 +1,6 @@
 """Control of contact forces: the wrist sensor's wrench, hybrid motion/force control, and a server
-of both."""
+of both.
+"""
 
 from rack.levels.systems.force.arm_executor import ForceArmExecutor
 from rack.levels.systems.force.client import ForceClient

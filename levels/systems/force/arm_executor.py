@@ -54,7 +54,8 @@ class ContactWrench:
 
     def take(self, raw: Array, state: Array, acceleration: Array) -> None:
         """Take a sample (6,), N, N m, at the state (2, joints), rad, rad/s, and the accelerations
-        (joints,), rad/s2."""
+        (joints,), rad/s2.
+        """
         self.raw[:] = raw
         self.saturated = not bool((np.abs(raw) < self._range).all())  # written so that NaN counts
         if not np.isfinite(raw).all():
@@ -82,7 +83,8 @@ class ContactWrench:
 
 class ForceArmParams(ArmParams):
     """`[board.<name>.params]`: the arm, and its reactions to faults of sensors and motors and to
-    strong contacts."""
+    strong contacts.
+    """
 
     on_force_limit: Reacting = "brake"
     """reaction to a contact beyond the limits: ramp to rest and hold, or ramp and brake, or
@@ -190,7 +192,8 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
 
     def find_terms(self) -> Terms:
         """Return the equation of motion at the sensed state, with what the gripper holds, and with
-        the contact."""
+        the contact.
+        """
         terms = super().find_terms()
         terms.bias[:] -= self.contact.torque
         return terms

@@ -40,7 +40,8 @@ MAX_COSINE = 1e-3
 
 class FrameConfig(Table):
     """`[task.frame.<name>]`: a task frame by two of its axes, in the world's frame, of any
-    length."""
+    length.
+    """
 
     x: Vector
     """its x axis"""
@@ -69,7 +70,8 @@ class FrameConfig(Table):
 
 class ContactConfig(Table):
     """`[task.contact.<name>]`: a contact for the calls `comply` and `guard`; axes that are not
-    named are of motion."""
+    named are of motion.
+    """
 
     frame: str
     """task frame"""
@@ -91,7 +93,8 @@ class ForceProgram(Program):
 
     def misfits(self, robot: RobotConfig | None, scene: SceneConfig) -> Misfits:
         """Yield frames that are none, and contacts in no frame, or beyond the limits of arm and
-        sensor."""
+        sensor.
+        """
         bent = {name: reason for name, frame in self.frame.items() if (reason := frame.objection())}
         for name, reason in bent.items():
             yield f"frame.{name}", self.frame[name].model_dump(), reason
@@ -138,7 +141,8 @@ def by_axis(values: Mapping[Axis, float]) -> Array:
 
 class ForceMotions(Motions):
     """Requests for forces and motions as calls. A call raises `LevelError` at once for a contact
-    that is impossible."""
+    that is impossible.
+    """
 
     def __init__(
         self,

@@ -1,5 +1,6 @@
 """The contact that requests have asked for: which axes of a task frame are of force, and what ends
-a motion; and the base of the levels that need a wrist sensor for it."""
+a motion; and the base of the levels that need a wrist sensor for it.
+"""
 
 from __future__ import annotations
 
@@ -56,7 +57,8 @@ class Contact:
 
     def comply(self, wanted: Wanted) -> bool:
         """Replace the axes of force, and the guards if the frame is another; return whether motion
-        begins anew."""
+        begins anew.
+        """
         selected = wanted.selected
         turned = not self._is_frame(wanted.frame)
         begins_anew = self.complies and (turned or bool((self.selected != selected).any()))

@@ -1,5 +1,6 @@
 """The executor of a level of hybrid motion/force control, between a trajectory level and boards
-that servo joints."""
+that servo joints.
+"""
 
 from __future__ import annotations
 

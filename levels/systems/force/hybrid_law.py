@@ -134,7 +134,8 @@ class HybridLaw:
         self, motion: Motion, task: ForceTask | None, passed_s: float, payload: Payload
     ) -> JointMotion:
         """Return the command for a `motion`, `passed_s` after the last; without a `task` all axes
-        are of motion."""
+        are of motion.
+        """
         q = motion.position
         qd = motion.velocity
         wanted = np.zeros(len(q)) if task is None else self._velocity(motion, task, passed_s) - qd
@@ -160,7 +161,8 @@ class HybridLaw:
 
     def _velocity(self, motion: Motion, task: ForceTask, passed_s: float) -> Array:
         """Return the joint velocities, rad/s, that follow the motion on its axes, and move for
-        force on the others."""
+        force on the others.
+        """
         self._there.look(motion.position + self._base, motion.velocity)
         self._here.look(motion.position + self._away, motion.velocity + self._speed)
         there = self._there.pose
@@ -193,7 +195,8 @@ class HybridLaw:
         payload: Payload,
     ) -> tuple[Array, Array]:
         """Return inertia and load, N m, there; the force fed forward follows the one wanted at the
-        loop's pace."""
+        loop's pace.
+        """
         self._here.look(position, velocity, payload)
         forward = (
             np.zeros(AXES)
@@ -215,7 +218,8 @@ def turned(rotation: Array, vector: Array) -> Array:
 
 def damped_inverse(jacobian: Array, twist: Array) -> Array:
     """Return the joint velocities J^T (J J^T + d)^-1 `twist` (6,): finite near singularities, see
-    `DAMPING`."""
+    `DAMPING`.
+    """
     square = gram(np.ascontiguousarray(jacobian.T))
     square.flat[:: AXES + 1] += DAMPING
     return transposed_mat_vec(jacobian, solve(square, twist))

@@ -65,7 +65,8 @@ class ComplianceHead(RelayedCommand):
 
 class Compliance(ComplianceHead, TaskContact, version=1):
     """From the motion server to the level of hybrid control. `id` rises with every change; a guard
-    strikes once an id."""
+    strikes once an id.
+    """
 
 
 class ForceStatus(AnsweringStatus, version=1):

@@ -1,5 +1,6 @@
 """The executor of a server of force and motion: does a client's requests, those of a trajectory
-level, COMPLY and GUARD, and outlives the client."""
+level, COMPLY and GUARD, and outlives the client.
+"""
 
 from __future__ import annotations
 
@@ -112,7 +113,8 @@ class ServerWork(RequestWork):
 
     def off(self) -> Array:
         """Return by how much forces are off, (6,), as parts of what is tolerated; 0 on axes of
-        motion."""
+        motion.
+        """
         contact = self.contact
         force = self.force
         if force is None:
@@ -130,7 +132,8 @@ class ServerWork(RequestWork):
 
     def _judge(self) -> None:
         """Count how long forces have been as wanted; end compliance when they have not settled for
-        too long."""
+        too long.
+        """
         off = self.off()
         current = self.agenda.current
         params = self._params

@@ -1,5 +1,6 @@
 """A hand of fingers driven by pairs of tendons: its plant, and its loops from tendon tension to
-grasp."""
+grasp.
+"""
 
 from rack.levels.systems.hand.executor import HandExecutor
 from rack.levels.systems.hand.grasp import GraspExecutor

@@ -101,7 +101,8 @@ class GraspExecutor(Executor):
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Misfits:
         """Yield a robot without a hand, and every finger that is not driven by exactly one board
-        below."""
+        below.
+        """
         hand = context.robot.hand
         if hand is None:
             yield "executor", cls.__name__, "it drives a hand, but there is no [robot.hand]"
@@ -192,7 +193,8 @@ class GraspExecutor(Executor):
 
     def _needs_plan(self) -> bool:
         """Return whether the current step takes its numbers from a plan: a CLOSE, or the PRESHAPE
-        before it."""
+        before it.
+        """
         kinds = [type(step) for step in self._program.step[self._done : self._done + 2]]
         return kinds[:1] == [CloseStep] or kinds == [PreshapeStep, CloseStep]
 
@@ -235,7 +237,8 @@ class GraspExecutor(Executor):
 
     def _prepare_step(self, index: int) -> Step:
         """Return a step of the program, completed from the plan, with displacements in the frame of
-        the palm."""
+        the palm.
+        """
         step = self._program.step[index]
         plan = self._plan
         if isinstance(step, ShiftStep):

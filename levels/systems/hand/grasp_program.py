@@ -1,5 +1,6 @@
 """The program of a grasp, in `[task]`: named postures of the fingers, and steps that begin and end
-with an open hand."""
+with an open hand.
+"""
 
 from __future__ import annotations
 
@@ -109,7 +110,8 @@ class GraspProgram(Program):
 
     def misfits(self, robot: RobotConfig | None, scene: SceneConfig) -> Misfits:
         """Yield key, value and reason of everything that the hand or the scene lacks, and of steps
-        in the wrong order."""
+        in the wrong order.
+        """
         if robot is None or robot.hand is None:
             return
         hand = robot.hand

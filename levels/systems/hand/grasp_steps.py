@@ -37,7 +37,8 @@ SLIPPED_PART = 0.2
 
 class FingersBelow:
     """State of all fingers, merged from the `FingerStatus` of each board. Points and forces are in
-    the frame of the palm."""
+    the frame of the palm.
+    """
 
     def __init__(self, context: LevelContext, fingers: Sequence[Ints]) -> None:
         """Start without statuses.
@@ -96,7 +97,8 @@ class GraspParams(GripGains):
 @dataclass
 class Grasp:
     """State that all steps share: sensed fingers, object, and targets. Points are in the frame of
-    the palm."""
+    the palm.
+    """
 
     params: GraspParams
     names: tuple[str, ...]  # names of the fingers
@@ -163,7 +165,8 @@ class StepWork(ABC):
 
 def minimum_jerk(time: float) -> tuple[float, float]:
     """Return position, 0 to 1, and rate of a minimum-jerk motion (Flash and Hogan, 1985) at
-    `time`, 0 to 1."""
+    `time`, 0 to 1.
+    """
     x = min(max(time, 0.0), 1.0)
     return x * x * x * (10.0 - 15.0 * x + 6.0 * x * x), 30.0 * x * x * (1.0 - x) * (1.0 - x)
 
@@ -205,7 +208,8 @@ class PreshapeWork(StepWork):
 
 class CloseWork(StepWork):
     """Moves the tips at constant speed towards points in the object until each touches it. A tip
-    that touches stays there and presses."""
+    that touches stays there and presses.
+    """
 
     step: CloseStep
 
@@ -263,7 +267,8 @@ class CloseWork(StepWork):
 
 class GrippingWork(StepWork):
     """Base of the steps during which the fingers grip the object: they maintain the grip and detect
-    its loss."""
+    its loss.
+    """
 
     def set_start(self) -> None:
         """Start with every finger in contact."""
@@ -308,7 +313,8 @@ class GrippingWork(StepWork):
 
 class SqueezeWork(GrippingWork):
     """Raises the grip force. The object settles between the fingers, and its anchor is its position
-    at the end."""
+    at the end.
+    """
 
     step: SqueezeStep
 
@@ -329,7 +335,8 @@ class SqueezeWork(GrippingWork):
 
 class ShiftWork(GrippingWork):
     """Moves the anchor of the object and the points of the tips by `step.by`, in the frame of the
-    palm."""
+    palm.
+    """
 
     step: ShiftStep
 

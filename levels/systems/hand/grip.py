@@ -45,7 +45,8 @@ class GripGains(Table):
 
 class HandGrip:
     """The grip of several fingers, one of which opposes the others. All forces are of the tips on
-    the object."""
+    the object.
+    """
 
     def __init__(self, gains: GripGains, fingers: Mask, opposing: int, period_s: float) -> None:
         """Start without force.
@@ -89,7 +90,8 @@ class HandGrip:
 
     def follow_creep(self, points: Array, tips: Array) -> None:
         """Move the `points` of the springs, (fingers, 3), m, towards the tips, all by the same
-        displacement."""
+        displacement.
+        """
         stiffness = self.stiffness[:, None]
         whole = float(self.stiffness.sum())
         way = self._gains.creep * self._period_s * (stiffness * (tips - points)).sum(axis=0) / whole
@@ -98,7 +100,8 @@ class HandGrip:
 
     def find_forces(self, tips: Array) -> Array:
         """Return the forces of the fingers, (fingers, 3), N, for tips at `tips`, (fingers, 3),
-        m."""
+        m.
+        """
         return np.asarray(
             self.shares[:, None]
             * (0.5 * self.load - self.force * self.find_outward_directions(tips))
@@ -106,7 +109,8 @@ class HandGrip:
 
     def find_outward_directions(self, tips: Array) -> Array:
         """Return unit vectors from the object to each tip, (fingers, 3), zero for fingers that do
-        not grip."""
+        not grip.
+        """
         directions = np.zeros_like(tips)
         line = tips[self._opposing] - (self.shares[:, None] * tips)[self._others].sum(axis=0)
         span = norm(line)

@@ -57,7 +57,8 @@ class FingerKinematics:
 
     def find_jacobian(self, finger: int) -> Array:
         """Return the Jacobian of a finger's tip with respect to the joints of the finger, (3,
-        joints of the finger), m/rad."""
+        joints of the finger), m/rad.
+        """
         mujoco.mj_jacSite(self._cell.model, self._data, self._whole, None, self._tips[finger])
         own = np.take(self._whole, self._cell.dof[self.joints[finger]], axis=1)
         rotated = np.empty_like(own)

@@ -106,7 +106,8 @@ class FingertipLaw:
 
     def find_tips(self, position: Array) -> Array:
         """Return the tips, (fingers, 3), m, of the driven fingers at sensed joint positions,
-        (joints,), rad."""
+        (joints,), rad.
+        """
         self.kinematics.set_position(position)
         for finger in self._fingers:
             self._tips[finger] = self.kinematics.find_tip(finger)
@@ -150,7 +151,8 @@ class FingertipLaw:
 
     def _approach_points(self, fingers: Sequence[int], points: Array) -> None:
         """Move the targets of `fingers` towards joint positions with tips at `points`, (fingers,
-        3), m."""
+        3), m.
+        """
         for _ in range(STEPS):
             self.kinematics.set_position(self.wanted)
             for finger in fingers:
@@ -279,7 +281,8 @@ class TendonGains(Table):
 
 class TendonLaw:
     """Computes the tensions for some joints of a hand. Corrections of valves are lost in a
-    restart and learned again."""
+    restart and learned again.
+    """
 
     def __init__(self, hand: Hand, driven: Mask, gains: TendonGains, context: LevelContext) -> None:
         """Drive the joints of the mask `driven`, (joints,), in every cycle of a level."""

@@ -111,7 +111,8 @@ class HandLoop(Executor):
     @abstractmethod
     def follow_command(self, hand: HandStatus, tick: int) -> None:
         """Fill the command for `self.followed`, and the fields of the status that are specific to
-        the loop."""
+        the loop.
+        """
 
     def process(self, tick: int) -> None:
         """Follow the newest command and fill the status."""
@@ -144,7 +145,8 @@ class HandLoop(Executor):
 
     def command_age_s(self, tick: int) -> float:
         """Return the time by which the command is extrapolated, s: its age, at most a cycle of the
-        level above."""
+        level above.
+        """
         return min(tick - self._taken, self._period) * self.context.tick_s
 
     def _take_command(self, command: Reading[RelayedCommand], tick: int) -> None:

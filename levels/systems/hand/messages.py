@@ -149,7 +149,8 @@ class LoopStatus(AnsweringStatus, version=1):
 
 class FingerStatus(AnsweringStatus, version=1):
     """From the fingertip loop, or from a board that runs all loops of a finger, to the grasp
-    loop."""
+    loop.
+    """
 
     driven: ndarray = field("u1", unit="1", doc="1 for fingers of this board", shape="fingers")
     sensed: int = SENSED
@@ -186,7 +187,8 @@ class GraspStatus(AnsweringStatus, version=1):
 
 class GraspPlan(RelayedCommand, version=1):
     """From a planner, on a board or on the host side, to the grasp loop: contacts of the fingers on
-    an object, and the posture from which they close. The newest with an `id` above 0 is used."""
+    an object, and the posture from which they close. The newest with an `id` above 0 is used.
+    """
 
     object: int = integer("row of the object in the world model", "i2")
     sensed: int = field(unit="tick", doc="tick of the world model on which it depends")

@@ -16,7 +16,8 @@ from rack.levels.tables import SceneConfig
 
 class HandSample(NamedTuple):
     """One sample of a hand's sensors. Positions and velocities have the resolution and noise of
-    their encoders."""
+    their encoders.
+    """
 
     position: Array  # (joints,), rad
     velocity: Array  # (joints,), rad/s
@@ -81,12 +82,14 @@ class SimulatedHand(Simulation):
     @property
     def wanted(self) -> Array:
         """Tensions commanded of open valves, or equilibrium tensions of closed ones, (2, joints),
-        N."""
+        N.
+        """
         return np.asarray(np.clip(self._data.ctrl[self.hand.actuators], 0.0, self.hand.most))
 
     def sense(self) -> HandSample:
         """Return the newest sample. Torques, tensions and forces are one simulation step old, as
-        always in MuJoCo."""
+        always in MuJoCo.
+        """
         position, velocity = self._state
         if self._coarse is not None:
             position, velocity = self._coarse.sample(position, velocity, self.tick)
@@ -111,7 +114,8 @@ class SimulatedHand(Simulation):
 
     def step(self, ticks: int) -> None:
         """Simulate `ticks` ticks. After a simulation fault the hand stays in its last valid state
-        while time continues."""
+        while time continues.
+        """
         self.contact = None
         for _ in range(ticks):
             self.braked = self.braked or self.waited >= self.patience

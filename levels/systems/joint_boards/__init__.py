@@ -1,5 +1,6 @@
 """Joints servoed by boards of their own: the arm's board gets their torques; a gateway joins them
-to a level above."""
+to a level above.
+"""
 
 from rack.levels.systems.joint_boards.arm_executor import ArmExecutor
 from rack.levels.systems.joint_boards.gateway import JointGateway, NetworkGateway

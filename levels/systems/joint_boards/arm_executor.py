@@ -1,5 +1,6 @@
 """The executor of a board of the arm: gives it the torques of the boards that servo its joints, or
-brakes it."""
+brakes it.
+"""
 
 from __future__ import annotations
 
@@ -98,7 +99,8 @@ class ArmExecutor(ArmDriver):
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Misfits:
         """Yield every joint, and the gripper, that not exactly one board above drives, and what
-        `ArmDriver` yields."""
+        `ArmDriver` yields.
+        """
         yield from super().misfits(context, above, below)
         everything = context.robot.joints
         wanted = {other.board: other.params.get("joints", everything) for other in above}
@@ -175,7 +177,8 @@ class ArmExecutor(ArmDriver):
 
     def _must_rest(self, stops: bool, tick: int) -> bool:
         """Return whether the arm `stops`, and the boards above have had enough time to bring it to
-        rest."""
+        rest.
+        """
         if not stops:
             self._rest_by = None
         elif self._rest_by is None:

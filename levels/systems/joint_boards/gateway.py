@@ -1,5 +1,6 @@
 """Executors of a board that joins a trajectory level to boards that servo joints: across a link
-with a delay, or across a network, where the level above runs in another rack."""
+with a delay, or across a network, where the level above runs in another rack.
+"""
 
 from __future__ import annotations
 
@@ -162,7 +163,8 @@ class NetworkGateway(JointGateway):
     """Follows references of another rack, due later by `delay`, within which they must have come.
 
     They are due at ticks of that rack, whose time next to ours its `PeerPresence` shows. The board
-    is DONE, or in ERROR, when the program of that rack is: then it may end the run."""
+    is DONE, or in ERROR, when the program of that rack is: then it may end the run.
+    """
 
     above = Input(JointReference, "lan.reference")
     task = Input(TaskStatus, "lan.program")
@@ -206,7 +208,8 @@ class NetworkGateway(JointGateway):
 
     def _follow(self, ahead_s: float) -> None:
         """Take over the other rack's time while no reference is followed; later only approach it:
-        the clocks drift."""
+        the clocks drift.
+        """
         apart_s = ahead_s - self._their_s
         if not self._due:
             self._their_s = ahead_s

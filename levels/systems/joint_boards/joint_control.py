@@ -1,5 +1,6 @@
 """The law of a board that servoes joints of an arm: each by itself, with the inertia and load that
-it is given."""
+it is given.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +24,8 @@ DUE = slice(2, 4)
 
 class JointLoads:
     """Inertia and load of every joint: interpolated between references; computed where there is
-    none."""
+    none.
+    """
 
     def __init__(self, cell: Cell) -> None:
         joints = len(cell.dof)
@@ -44,7 +46,8 @@ class JointLoads:
 
     def misfit(self, command: JointReference) -> str:
         """Return the field of a `JointReference` that asks for more than the arm can do; empty:
-        none does."""
+        none does.
+        """
         # Written so that NaN is too much.
         within = {
             "position": (self._low <= command.position) & (command.position <= self._high),
@@ -78,7 +81,8 @@ class JointLoads:
 
     def hold(self, position: Array) -> None:
         """Compute them for an arm at rest at `position`, (joints,), rad, unless they were computed
-        near it."""
+        near it.
+        """
         if (np.abs(position - self._computed_at) < MOVED_RAD).all():
             return
         inertia, bias = self._dynamics.terms(position, self._still, self._payload)

@@ -1,5 +1,6 @@
 """The executor of a board that servoes some or all joints of an arm whose plant is on a board of
-its own."""
+its own.
+"""
 
 from __future__ import annotations
 
@@ -112,7 +113,8 @@ class JointServo(Executor):
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Misfits:
         """Yield joints that the arm lacks or that are named twice, an idle board, and modifications
-        that do not fit."""
+        that do not fit.
+        """
         params = read_params(JointServoParams, context.params)
         known = context.robot.joints
         named = known if params.joints is None else params.joints

@@ -27,7 +27,8 @@ from rack.levels.operator import AnsweringStatus, RelayedCommand, SampledCommand
 
 class JointReference(RelayedCommand, version=1):
     """From the trajectory level to all boards that servo joints; these interpolate between its set
-    points."""
+    points.
+    """
 
     due: int = field(
         unit="tick", doc="tick at which the arm should be there; 0: no set point, hold"
@@ -48,7 +49,8 @@ class JointReference(RelayedCommand, version=1):
 class JointTorque(SampledCommand, version=1):
     """From a board that servoes joints to the board of the arm, which adds them up; id rises with
     every
-    cycle."""
+    cycle.
+    """
 
     sampled: int = field(
         unit="tick", doc="tick of the arm's status that it rests on; -1: none yet, so no torque"
@@ -92,7 +94,8 @@ class SensedStatus(AnsweringStatus):
 
 class ArmStatus(SensedStatus, DrivenArm, version=2):
     """From the board of the arm to those that servo joints; a servo level's status without set
-    points of its own."""
+    points of its own.
+    """
 
 
 DRIVING = (ServoStatus.message_type.name, ArmStatus.message_type.name)

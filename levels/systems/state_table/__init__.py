@@ -1,5 +1,6 @@
 """State tables: levels whose executors are tables in TOML files, with static plans and no
-planners."""
+planners.
+"""
 
 from rack.levels.systems.state_table.elemental_move import MoveTable
 from rack.levels.systems.state_table.level import StateTableExecutor

@@ -112,7 +112,8 @@ def _states(table: StateTable) -> Iterator[str]:
 
 def _cases(state: str, rows: Mapping[int, RowConfig], vocabulary: Vocabulary) -> Iterator[str]:
     """Yield overlaps of the rows of one state, rows that never fire, and cases that no row
-    takes."""
+    takes.
+    """
     named = [
         name for name in vocabulary.conditions if any(name in row.when for row in rows.values())
     ]
@@ -146,7 +147,8 @@ def _cases(state: str, rows: Mapping[int, RowConfig], vocabulary: Vocabulary) ->
 
 def without(box: Box, taken: Box) -> Sequence[Box]:
     """Return disjoint boxes that hold the cases of `box` that are not in `taken`; both name the
-    same conditions."""
+    same conditions.
+    """
     pieces = []
     rest = dict(box)
     for condition, values in taken.items():

@@ -199,7 +199,8 @@ class MoveTable(StateTableExecutor):
 
     def _tool_at(self, height: float) -> Pose | None:
         """Return the pose of the tool, pointing down, at a height above the object or place of the
-        command; None: a command without either, or none, is in force."""
+        command; None: a command without either, or none, is in force.
+        """
         if len(self.words) < 2:
             return None
         verb, name = self.words
@@ -222,7 +223,8 @@ class MoveTable(StateTableExecutor):
 
     def _solve(self, goal: Pose) -> Array | None:
         """Return joint positions, rad, at a pose: on the branch of the arm, else from home; at most
-        three descents."""
+        three descents.
+        """
         joints = self._ik.nearby(goal, self._command.joints)
         if joints is None:
             joints = self._ik.reach(goal, self._cell.home)

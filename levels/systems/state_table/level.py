@@ -65,7 +65,8 @@ class TableCommand(RelayedCommand, version=1, message="word_command"):
 
 class TableStatus(AnsweringStatus, version=1):
     """First fields of the status of every level of this kind: with them a restarted board goes
-    on."""
+    on.
+    """
 
     table: str = field(f"S{NAME_BYTES}", doc="state table in force")
     checksum: int = integer("CRC-32 of its file")
@@ -101,7 +102,8 @@ def vocabulary(
     plan: type[Table] = Table,
 ) -> Vocabulary:
     """Return the vocabulary of a level: its own words and, if it accepts commands, those that come
-    with them."""
+    with them.
+    """
     known = {**conditions, LATE: YES_NO}
     if not commands:
         return Vocabulary(known, {}, actions, plan)
@@ -124,7 +126,8 @@ OPERATIONS: Commands = {**HOLDABLE, Operation.TABLE: ()}
 
 class StateTableExecutor(Executor):
     """Base of the levels: a class declares its `vocabulary`, and has `look`, and `do_<action>` for
-    each action."""
+    each action.
+    """
 
     commands: ClassVar[Commands] = {**OPERATIONS, Operation.DO: ()}
     above = Inputs(TableCommand, "above.command", optional=True)
@@ -199,7 +202,8 @@ class StateTableExecutor(Executor):
         cls, tables: Mapping[str, StateTable], scene: SceneConfig
     ) -> Iterator[tuple[str, str]]:
         """Yield tables that do not know a command that another one does, and why: the one in force
-        outlives a swap."""
+        outlives a swap.
+        """
         known = {name: cls._known(scene, table) for name, table in tables.items()}
         for name, mine in known.items():
             lacking = {
@@ -231,7 +235,8 @@ class StateTableExecutor(Executor):
 
     def use(self, name: str) -> None:
         """Put a table in force. It goes on in the state of the same name; without one, in the state
-        it starts in."""
+        it starts in.
+        """
         self.table_name = name
         self.table = self.tables[name]
         if self.state not in self.table.rows:
@@ -286,7 +291,8 @@ class StateTableExecutor(Executor):
 
     def recall(self) -> None:
         """Continue from the last messages in the level's own mailboxes, after a restart of its
-        board."""
+        board.
+        """
         if not self.last_status.is_there:
             return
         last = self.last_status.message

@@ -130,7 +130,8 @@ class PrimitiveTable(StateTableExecutor):
 
     def recall(self) -> None:
         """Continue with the gripper as it is; the arm's motion begins anew from where the boards
-        below hold it."""
+        below hold it.
+        """
         super().recall()
         if self.last_status.is_there:
             last = self.last_status.message
@@ -204,7 +205,8 @@ class PrimitiveTable(StateTableExecutor):
 
     def do_begin(self) -> None:
         """Begin the motion to the joints of the command in force, from rest; while the arm moves,
-        halt."""
+        halt.
+        """
         if self._curve is not None:
             self.do_halt()
             return

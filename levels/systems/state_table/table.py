@@ -65,7 +65,8 @@ Lexicon = Mapping[str, Sequence[str]]
 @dataclass(frozen=True)
 class Vocabulary:
     """All words of one kind of level. `plan` is the record of `[plan]`, the static plan in the file
-    of a table."""
+    of a table.
+    """
 
     conditions: Mapping[str, Values]
     commands: Phrases
@@ -200,7 +201,8 @@ class StateTable:
 
     def decide(self, state: str, values: Mapping[str, str]) -> tuple[int, RowConfig]:
         """Return the row that fires, after its number; number 0, an error: no row takes the case,
-        which cannot happen in a table that was checked."""
+        which cannot happen in a table that was checked.
+        """
         for number, row in self.rows.get(state, {}).items():
             if row.matches(values):
                 return number, row

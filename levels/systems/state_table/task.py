@@ -1,5 +1,6 @@
 """The task level as a state table: a static list of steps, each an object and the place to which it
-goes."""
+goes.
+"""
 
 from __future__ import annotations
 
@@ -57,7 +58,8 @@ class TaskPlanConfig(Table):
 
 class TaskTable(StateTableExecutor):
     """Sends the commands of its steps to the level below, one after the other, as its table
-    says."""
+    says.
+    """
 
     above = None  # type: ignore[assignment]  # drops the port: nothing commands it
     below = Input(MoveTableStatus, "below.status")

@@ -30,7 +30,8 @@ class JointBoards:
         self, joints: Sequence[str], ranges: Array, handover: int = HANDOVER_CYCLES
     ) -> None:
         """Await the joints' answer to the first set point for `handover` cycles. `ranges`,
-        (joints, 2), rad: where joints can be."""
+        (joints, 2), rad: where joints can be.
+        """
         self._joints = joints
         self._low, self._high = ranges.T
         self._handover = handover
@@ -57,7 +58,8 @@ class JointBoards:
 
     def leave(self, why: str) -> None:
         """Let all fall out of step: they come to rest by themselves, and motion begins again from
-        where they hold."""
+        where they hold.
+        """
         self.in_step = False
         self.awaited = why
 

@@ -147,7 +147,8 @@ class Motions:
 
     def wait(self, request: int | None = None, until: Callable[[], bool] = lambda: False) -> bool:
         """Wait until a request, by default the newest, has ended; False if `until` holds before, or
-        the run ends."""
+        the run ends.
+        """
         while not self.done(request):
             if until() or self._bus.is_over:
                 return False
@@ -175,7 +176,8 @@ class Motions:
 
     def _send(self, fields: Mapping[str, Any]) -> bool:
         """Send a request with these fields, all others 0. Raises `AttributeError` for an unknown
-        field."""
+        field.
+        """
         request = self._requests.message
         # One that was refused, or had an unknown field, has left its fields.
         request.clear()
@@ -185,7 +187,8 @@ class Motions:
 
     def _look(self) -> None:
         """Wait for news; send the requests again that are lost: nothing is under way, and not all
-        are done."""
+        are done.
+        """
         self._bus.wait(LOOK_S)
         status = self._status
         now = self._bus.time_s

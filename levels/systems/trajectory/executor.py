@@ -1,5 +1,6 @@
 """The executor of a trajectory level: follows the motion requests of its queue with a set point
-every cycle."""
+every cycle.
+"""
 
 from __future__ import annotations
 

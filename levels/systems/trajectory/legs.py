@@ -77,7 +77,8 @@ class WorldSight:
 
     def frame(self, row: int, time_s: float) -> tuple[Pose, Array]:
         """Return where body `row` should be at `time_s`, and its velocity (3,), m/s; zero for one
-        not seen lately."""
+        not seen lately.
+        """
         model = self._model
         if model is None:
             raise Unfit("nothing is known of the world")
@@ -105,7 +106,8 @@ class ToolGoal:
 
     def update(self, time_s: float) -> None:
         """Evaluate the goal for the sample at `time_s`; again for the same one does nothing. Raises
-        `Unfit`."""
+        `Unfit`.
+        """
         if self._body < 0 or time_s == self._stamp_s or (self._frame is not None and not self.live):
             return
         seen, velocity = self._sight.frame(self._body, time_s)
@@ -119,12 +121,14 @@ class ToolGoal:
 
     def astray(self, position: Array, time_s: float) -> float:
         """Return the distance, m, of a tool position at `time_s` from the goal on the body,
-        unsmoothed."""
+        unsmoothed.
+        """
         return norm((self._sight.frame(self._body, time_s)[0] @ self._goal).position - position)
 
     def _followed(self, frame: Pose, seen: Pose, velocity: Array, passed_s: float) -> Pose:
         """Return the frame that goes after the body, critically damped; its turning is followed
-        with a lag."""
+        with a lag.
+        """
         pace = 1.0 / self._follow_s
         turn = np.zeros(3)
         quaternion = frame.quaternion.copy()
@@ -160,7 +164,8 @@ class TimeLaw:
     @property
     def nominal_s(self) -> float:
         """Time at which the goal would be reached at full speed: the middle of a blend into another
-        leg."""
+        leg.
+        """
         return self.half_blend_s + self.segment_s
 
     @property
@@ -243,7 +248,8 @@ class ToolLeg:
 
     def _try_out(self, start: Array, goal: Pose) -> tuple[Array, Array]:
         """Return the greatest first and second derivative of the joints by the part of the way,
-        (joints,) each."""
+        (joints,) each.
+        """
         way = norm(goal.position - self._from.position)
         turn = self._from.angle_to(goal)
         steps = min(max(ceil(way / STEP_M), ceil(turn / STEP_RAD), 4), MAX_STEPS)
@@ -279,11 +285,13 @@ def timed(times: Times, speed: Array, bend: Array, limits: Limits) -> TimeLaw:
 
 class Settling:
     """A ramp to rest of every joint by itself: matched position, velocity and acceleration, then
-    rest."""
+    rest.
+    """
 
     def __init__(self, state: tuple[Array, Array, Array], most: Array, least_s: float) -> None:
         """Begin at `state`, rad, rad/s, rad/s2, within the accelerations `most`, in `least_s` or
-        more."""
+        more.
+        """
         self._position, self._velocity, acceleration = state
         # The peak is at most 1.5 |v| / T + |a| / 3, and |a| at the begin.
         self._acceleration = np.clip(acceleration, -most, most)

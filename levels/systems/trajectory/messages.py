@@ -1,5 +1,6 @@
 """Motion requests, which a planning level or a program queues, and the status of the level that
-does them."""
+does them.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +49,8 @@ class RequestEnd(IntEnum):
 class MotionRequest(RelayedCommand, version=1):
     """`id` numbers requests, rising by one from 1 in the order of the queue; one not above those
     taken
-    is a repetition."""
+    is a repetition.
+    """
 
     kind: MotionKind = field(doc="what to do")
     joints: ndarray = per_joint("rad", "goal of JOINTS")
@@ -80,7 +82,8 @@ class MotionRequest(RelayedCommand, version=1):
 
 class MotionState(Message, version=1):
     """What a restarted trajectory level needs, with its status, to neither repeat nor lose a
-    request."""
+    request.
+    """
 
     begun: bool = field(doc="1: the first of `requests` is under way")
     passed: float = field(unit="s", doc="time that it has stayed or gripped")

@@ -29,7 +29,8 @@ MAX_REST_RAD = 1e-7
 
 class SampledMotion:
     """Begins legs, blends them, stops: without a step in position or velocity, within the limits of
-    every joint."""
+    every joint.
+    """
 
     def __init__(
         self, limits: Limits, joints: tuple[str, ...], period_s: float, rest: Array
@@ -55,7 +56,8 @@ class SampledMotion:
 
     def advance(self, time_s: float) -> None:
         """Go on to the sample at `time_s`, the next one. Raises `Unfit` with the arm ramping to
-        rest."""
+        rest.
+        """
         self.time_s = time_s
         _, velocity, acceleration = self.state
         before, here = self._samples[1:]
@@ -87,7 +89,8 @@ class SampledMotion:
     @property
     def settled(self) -> bool:
         """Whether the leg, if there is one, has reached its goal, and nothing is left of the motion
-        before it."""
+        before it.
+        """
         if self.leg is not None and self.leg_s < self.leg.law.ends_s:
             return False
         return self._settling is None or self.time_s - self._settles_s >= self._settling.ends_s
@@ -149,7 +152,8 @@ class SampledMotion:
 
     def _check(self) -> None:
         """Raise `Unfit` if the present sample exceeds a limit, as when a live goal is too fast for
-        the arm."""
+        the arm.
+        """
         _, velocity, acceleration = self.state
         for values, limits, unit in (
             (velocity, self._limits.velocity, "rad/s"),

@@ -85,7 +85,8 @@ class MoveStep(MotionStep):
 
 class LineStep(MotionStep):
     """Move the tool along a straight line, to a pose in the world or in the frame of a body, which
-    it may follow."""
+    it may follow.
+    """
 
     do: Literal["line"] = "line"
     """the kind of step"""
@@ -184,7 +185,8 @@ class PlanningParams(Table):
 
 class RequestExecutor(Executor):
     """Reports the program done, or the error that ended it. It obeys no operator: the trajectory
-    level does."""
+    level does.
+    """
 
     below = Input(MotionStatus, "below.status")
     status = Output(TaskStatus, rests_on=below)
@@ -324,7 +326,8 @@ class RequestPlanner(Planner):
 
     def _goal_before(self, k: int, world: WorldState) -> Array:
         """Return joint positions at the end of the step before step k, planning it if need be, as
-        after a restart."""
+        after a restart.
+        """
         if k == 0:
             return self._home
         if k - 1 not in self._goals:

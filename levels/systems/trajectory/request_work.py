@@ -86,7 +86,8 @@ class RequestWork:
 
     def end_guarded(self) -> None:
         """End the request under way, GUARDED: the arm ramps to rest, and goes on from there with
-        the next one."""
+        the next one.
+        """
         self.agenda.end(RequestEnd.GUARDED)
         self.agenda.goal = None  # the arm is not there
         self.cancel()
@@ -163,7 +164,8 @@ class RequestWork:
 
     def _consider(self, request: MotionRequest) -> None:
         """Begin `request` if its time has come: nothing is under way, or the leg under way is to be
-        blended into it."""
+        blended into it.
+        """
         current = self.agenda.current
         leg = self.motion.leg
         if not self._can_begin(request):
@@ -178,7 +180,8 @@ class RequestWork:
 
     def _blend_s(self, leg: Leg, request: MotionRequest) -> float | None:
         """Return half the time in which `leg` slows down, if now is the time to blend it into
-        `request`."""
+        `request`.
+        """
         law = leg.law
         passed_s = self.motion.leg_s
         if passed_s > law.ends_s - 2.0 * law.leaving_s:
@@ -216,7 +219,8 @@ class RequestWork:
 
     def _move(self, request: MotionRequest, half_s: float, segment_s: float) -> None:
         """Begin the leg to the goal of `request`; the motion so far slows down over twice
-        `half_s`."""
+        `half_s`.
+        """
         tools = self._tools
         half_blend_s = max(request.acceleration or tools.params.acceleration, half_s)
         times = Times(segment_s, half_blend_s)

@@ -36,7 +36,8 @@ def copy_request(record: Any) -> MotionRequest:
 
 def misfit_of(request: MotionRequest, ranges: Array) -> str:
     """Return why no arm whose joints have `ranges`, (joints, 2), rad, could do a request; empty: it
-    may be possible."""
+    may be possible.
+    """
     if request.kind not in KINDS:
         return f"kind {request.kind}; permitted: {KINDS[0]} to {KINDS[-1]}"
     times = request.acceleration, request.segment

@@ -46,7 +46,8 @@ class Start:
 
 class BaseRack:
     """The faultless rack of one process that makes trials: its snapshots are in that process's
-    crate, and its trials have its `name`."""
+    crate, and its trials have its `name`.
+    """
 
     def __init__(self, config: RackConfig, name: str) -> None:
         self.name = name
@@ -57,7 +58,8 @@ class BaseRack:
 
     def start_of(self, plan: Plan, crate: WarmCrate | None, seconds: float | None) -> Start:
         """Return where the trial of a plan starts; run the base, for `seconds` where no task ends
-        it, if this crate has none."""
+        it, if this crate has none.
+        """
         if not (plan.faults or plan.kills):
             return Start()
         if not plan.lockstep or crate is None:

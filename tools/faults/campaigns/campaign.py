@@ -1,5 +1,6 @@
 """A campaign: a faultless run, trials with faults, kills and sizes, and faultless time; each run
-leaves a file."""
+leaves a file.
+"""
 
 from __future__ import annotations
 
@@ -69,7 +70,8 @@ class Order:
 
 class Campaign:
     """One campaign; with `whole`, no trial goes on from a snapshot. Raises `ConfigError`, and
-    `Failure` for a task that is not done even without faults."""
+    `Failure` for a task that is not done even without faults.
+    """
 
     def __init__(self, order: Order, folder: Path, progress: Progress, whole: bool = False) -> None:
         self.order = order
@@ -233,7 +235,8 @@ class Campaign:
 
     def _guess_s(self, plans: Sequence[Plan]) -> float:
         """Estimate the time that runs take: in lockstep a core simulates the default rack in a
-        third of real time."""
+        third of real time.
+        """
         real_s = self._ticks / self._second
         lockstep_s = real_s / 3.0 / len(os.sched_getaffinity(0))
         run_s = {True: lockstep_s, False: real_s}
@@ -242,7 +245,8 @@ class Campaign:
 
 def _kept(job: TrialJob) -> TrialResult | None:
     """Return the result that is kept of a trial; None for one of another plan, drawn by another
-    version."""
+    version.
+    """
     found = kept(job.path)
     return found if found is not None and found.plan == job.plan else None
 

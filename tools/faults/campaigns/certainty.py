@@ -52,7 +52,8 @@ def certain_from(
     strikes: Sequence[Strike], events: Sequence[Event], run: Circumstances, tick: int
 ) -> int | None:
     """Return the tick from which nothing that happens later can change the judgement of a run's
-    faults, as far as is known before `tick`; a later one at which to ask again; None: its end."""
+    faults, as far as is known before `tick`; a later one at which to ask again; None: its end.
+    """
     now = Event(0, tick, "end", "", "")
     return _ForesightedJudge(strikes, [*events, now], run).certain_from(tick)
 

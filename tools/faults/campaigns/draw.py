@@ -1,5 +1,6 @@
 """Random plans: which faults strike a trial, where, and when. The same seed draws the same
-plans."""
+plans.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +48,8 @@ SEEDS = 2**31
 @dataclass(frozen=True)
 class RackUnderTest:
     """The rack that plans are drawn for: its targets, ticks of a faultless run and of a second,
-    time of a restart."""
+    time of a restart.
+    """
 
     targets: Targets
     ticks: int
@@ -66,7 +68,8 @@ class RackUnderTest:
 
     def window(self, target: Target, ticks: int, parameters: Mapping[str, float]) -> int:
         """Return the ticks from the beginning of a fault to the next: it is found, over, and
-        recovered from."""
+        recovered from.
+        """
         layout = self.targets.layout
         kind = target.record
         tasks = [task.name for task in layout.tasks]
@@ -104,7 +107,8 @@ class Card:
     @classmethod
     def draw(cls, rack: RackUnderTest, kind: str, rng: Random, size: float | None = None) -> Card:
         """Draw a fault as the kind's record says; with a `size`, of a single joint, as a point of a
-        curve."""
+        curve.
+        """
         target = rng.choice(rack.targets.by_kind[kind])
         record = target.record
         joints = rack.targets.joints
@@ -170,7 +174,8 @@ def kill_plans(
     rack: RackUnderTest, count: int, seed: int, modes: Sequence[bool], first: int
 ) -> list[Plan]:
     """Return plans of kills from outside, `count` in all, in these modes by turns, numbered from
-    `first`."""
+    `first`.
+    """
     rng = Random(f"{seed} kills")
     targets = rack.targets.by_kind[EXTERNAL]
     gap = KILL_GAP_S * rack.second
@@ -189,7 +194,8 @@ def size_plans(
     rack: RackUnderTest, kinds: Sequence[str], count: int, seed: int, first: int
 ) -> list[Plan]:
     """Return plans in lockstep with `count` sizes of every kind that must be found from a certain
-    size."""
+    size.
+    """
     rng = Random(f"{seed} sizes")
     sizes = [(kind, size) for kind in kinds for size in swept_sizes(kind, count)]
     rng.shuffle(sizes)
@@ -274,7 +280,8 @@ def _shared_out(room: int, cards: Sequence[Card]) -> list[Share]:
 
 def _ordered(room: int, cards: Sequence[Card], rng: Random) -> list[Card]:
     """Return faults in the best of some random orders: if possible each begins before the end of a
-    task that those before it have prolonged, and those of the arm late: at first it is at rest."""
+    task that those before it have prolonged, and those of the arm late: at first it is at rest.
+    """
     orders = [rng.sample(cards, len(cards)) for _ in range(SHUFFLES)]
 
     def quality(order: list[Card]) -> tuple[bool, int]:
@@ -287,7 +294,8 @@ def _ordered(room: int, cards: Sequence[Card], rng: Random) -> list[Card]:
 
 def _starts(rack: RackUnderTest, windows: Sequence[int], rng: Random) -> list[int]:
     """Return a tick for each window, one after the other from a random tick on: a trial goes on
-    from the snapshot before its first fault."""
+    from the snapshot before its first fault.
+    """
     free = max(rack.first, rack.room - sum(windows))
     earliest = accumulate(windows, initial=rack.first + rng.randint(0, free))
     return list(earliest)[:-1]

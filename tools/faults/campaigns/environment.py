@@ -1,5 +1,6 @@
 """The surroundings of trials: a load on the machine, leftovers of racks, and a check of the
-violation counter."""
+violation counter.
+"""
 
 from __future__ import annotations
 

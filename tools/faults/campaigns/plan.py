@@ -25,7 +25,8 @@ Purpose = Literal["faults", "kills", "sizes", "nominal", "faultless"]
 @dataclass(frozen=True)
 class Kill:
     """One SIGKILL from outside, of the process of `board`. `phase` is the part of the tick that has
-    passed."""
+    passed.
+    """
 
     board: str
     tick: int
@@ -35,7 +36,8 @@ class Kill:
 @dataclass(frozen=True)
 class Plan:
     """One trial. `faults` are tables as in a config; `rack run CONFIG --faults FILE` repeats a
-    plan."""
+    plan.
+    """
 
     number: int
     purpose: Purpose
@@ -71,7 +73,8 @@ class Plan:
 
     def toml(self, config: str) -> str:
         """Return the faults as a file for `--faults`; kills from outside, which no file can hold,
-        as comments."""
+        as comments.
+        """
         mode = " --lockstep" if self.lockstep else ""
         faults = to_toml({"fault": [dict(table) for table in self.faults]})
         kills = [
@@ -84,14 +87,16 @@ class Plan:
 
 def needs_real_time(kind: str) -> bool:
     """Return whether a kind does not exist in lockstep, or means nothing there: no time passes
-    while a process dies."""
+    while a process dies.
+    """
     return kind == EXTERNAL or KINDS[kind].realtime
 
 
 @dataclass(frozen=True)
 class Target:
     """A place for a fault. `cycle`: the period of the task, or of a mailbox's messages, ticks;
-    `reader`: that of its fastest reader."""
+    `reader`: that of its fastest reader.
+    """
 
     kind: str
     board: str
@@ -107,7 +112,8 @@ class Target:
 
 class Targets:
     """The places in one rack where a fault of each kind can strike and be seen. `joints` is the
-    number of the arm's."""
+    number of the arm's.
+    """
 
     def __init__(self, config: RackConfig, layout: Layout) -> None:
         self.layout = layout
@@ -141,7 +147,8 @@ class Targets:
 
     def _is_seen(self, kind: Kind, box: MailboxSpec) -> bool:
         """Return whether the mailbox has readers, and messages often enough: plans are not
-        periodic."""
+        periodic.
+        """
         # The clock writes only for an operator, and a host board when its program says so.
         role = self._roles.get(box.writer)
         if role is None or not box.readers:

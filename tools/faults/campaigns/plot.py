@@ -58,7 +58,8 @@ def _places(figure: Figure) -> Iterator[SubplotSpec]:
 
 def _delays(axes: Axes, report: CampaignReport) -> None:
     """Draw each fault's time to detection as a part of its own bound; note median and longest in
-    cycles."""
+    cycles.
+    """
     kinds = list(report.by_kind)[::-1]
     for row, kind in enumerate(kinds):
         found = [fault for fault in report.faults_of(kind) if fault.seen == "detected"]
@@ -94,7 +95,8 @@ def _name_rows(axes: Axes, names: list[str]) -> None:
 
 def _part(fault: Judgement) -> float | None:
     """Return a fault's delay as a part of its bound; a bound of the same cycle is met exactly or
-    not at all."""
+    not at all.
+    """
     if fault.bound == 0 and fault.bound_ms is None:
         return 0.0 if fault.delay == 0 else 2 * WIDEST
     return fault.part_of_bound

@@ -1,5 +1,6 @@
 """The report of a campaign: one document, campaign.json, and campaign.md for people, from the same
-figures."""
+figures.
+"""
 
 from __future__ import annotations
 
@@ -50,7 +51,8 @@ KINDS_HEAD = [
 @dataclass(frozen=True)
 class CampaignSummary(FaultCounts):
     """The figures of all kinds together; `false_trips` are unexplained detections in faultless
-    time, `verdicts_certain` trials that ended as soon as the verdict on each fault was certain."""
+    time, `verdicts_certain` trials that ended as soon as the verdict on each fault was certain.
+    """
 
     trials: int
     tasks_done: int
@@ -72,7 +74,8 @@ class CampaignSummary(FaultCounts):
 
 class CampaignReport:
     """The figures of a campaign; `shortfalls`, the reasons why it fails, are empty when it
-    passes."""
+    passes.
+    """
 
     def __init__(self, campaign: Campaign, results: Results, wall_s: float) -> None:
         clock_ns = campaign.layout.clock_ns

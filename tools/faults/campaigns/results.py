@@ -79,7 +79,8 @@ def result_of(trial: Trial) -> TrialResult:
 
 def keep(trial: Trial, path: Path) -> None:
     """Judge a trial, and write it with all that happened in it to a file, which exists whole or not
-    at all."""
+    at all.
+    """
     outcome = asdict(trial.outcome) if trial.outcome else None
     document = {
         "finding": asdict(result_of(trial)),
@@ -106,7 +107,8 @@ def kept(path: Path) -> TrialResult | None:
 @dataclass(frozen=True)
 class Faultless:
     """Runs without faults in real time, `seconds` of simulated time, under `load`: a command, or ""
-    for alone."""
+    for alone.
+    """
 
     load: str
     seconds: float

@@ -83,7 +83,8 @@ class SizeCurve:
 
 def by_kind(faults: Sequence[Judgement], clock_ns: int) -> dict[str, KindFigures]:
     """Return the figures of each kind, in the order of `KINDS`; only faults that must be found
-    count."""
+    count.
+    """
     judged = [fault for fault in faults if fault.is_judged]
     kinds = dict.fromkeys([*KINDS.names, EXTERNAL])
     found = {kind: [fault for fault in judged if fault.kind == kind] for kind in kinds}

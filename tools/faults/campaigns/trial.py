@@ -52,7 +52,8 @@ RETRY_S = 0.02
 
 class Killer:
     """Kills boards of one rack by SIGKILL, at their instants, without the fault table. `done` are
-    the kills so far."""
+    the kills so far.
+    """
 
     def __init__(self, segment: Segment, kills: Sequence[Kill]) -> None:
         self._segment = segment

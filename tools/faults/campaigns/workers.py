@@ -1,5 +1,6 @@
 """Worker processes make the trials, as many at once as there are cores; each trial has its own rack
-and leaves a file."""
+and leaves a file.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +30,8 @@ LOOK_S = 0.2
 @dataclass(frozen=True)
 class TrialJob:
     """A trial to be made: `ticks` of a faultless run, `seconds` of simulated time where no task
-    ends the run."""
+    ends the run.
+    """
 
     plan: Plan
     path: Path
@@ -96,7 +98,8 @@ class Workers:
 
     def _stop(self) -> None:
         """End the workers. What is left of a trial in progress is of no use: its rack is removed,
-        not stopped."""
+        not stopped.
+        """
         for process in active_children():
             process.terminate()
 
@@ -126,7 +129,8 @@ class TrialMaker:
 
     def _ready(self, lockstep: bool) -> WarmCrate | None:
         """Return the crate for the next trial; None: the rack starts its own, as in real time,
-        where a crate that has served would be another machine."""
+        where a crate that has served would be another machine.
+        """
         if self._crate is not None and (self._crate.is_over or not lockstep):
             self._crate.end()
             self._crate = None

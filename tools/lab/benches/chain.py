@@ -1,5 +1,6 @@
 """A rack of empty boards, on all cores in turn: the first sends a message in every cycle, each
-other passes it on."""
+other passes it on.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +19,8 @@ PRIORITY = 80
 
 class Chain(NamedTuple):
     """`boards` boards at the clock's `rate_hz`; the first is on the last core, the clock on the
-    first."""
+    first.
+    """
 
     boards: int
     rate_hz: int

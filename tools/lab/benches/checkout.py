@@ -56,7 +56,8 @@ class RackCommand:
 
 def rack_commands(against: Path | None) -> list[RackCommand]:
     """Return the command line of this tree, and after it that of the checkout `against`, if there
-    is one. Raises `Failure`."""
+    is one. Raises `Failure`.
+    """
     this = RackCommand(THIS, (sys.executable, "-c", RUN))
     return [this] if against is None else [this, checkout(against)]
 

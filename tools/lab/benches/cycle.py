@@ -49,7 +49,8 @@ COMPARED = f"{SERVO}, lockstep"
 
 class CycleRun(NamedTuple):
     """The cycles of a run by executor, and the processor time of each tick's bare physics, us;
-    empty unless they were replayed."""
+    empty unless they were replayed.
+    """
 
     cycles: dict[str, Cycles]
     physics_us: list[float]
@@ -70,7 +71,8 @@ KINDS = tuple(
 @dataclass(frozen=True)
 class CycleCosts(Comparison):
     """A comparison of whole cycles, and the medians of the parts of each by case and contestant,
-    us."""
+    us.
+    """
 
     parts: Mapping[tuple[str, str], Mapping[str, float]] = field(default_factory=dict)
 
@@ -131,7 +133,8 @@ def _run(
     kind: RackKind, command: RackCommand, seconds: float, scratch: str, share: bool
 ) -> CycleRun:
     """Run one rack and take its cycles; of this tree's arm in lockstep, replay the physics at
-    once."""
+    once.
+    """
     folder = Path(mkdtemp(dir=scratch))
     lockstep = kind.mode == "lockstep"
     config = kind.config

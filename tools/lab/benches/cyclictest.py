@@ -31,7 +31,8 @@ PATIENCE_S = 30.0
 
 class WakeGrid(NamedTuple):
     """Points in time to sleep to on `core`: `wakes` of them, `period_ns` apart, at a `priority` of
-    SCHED_FIFO."""
+    SCHED_FIFO.
+    """
 
     core: int
     period_ns: int
@@ -85,7 +86,8 @@ def cyclictest(grid: WakeGrid) -> np.ndarray:
 
 def late_share(runs: Sequence[np.ndarray], period_ns: int) -> float | None:
     """Return the share of grid points at which a sleeper was late by a cycle or more, those it
-    skipped included; `runs` have the lateness of its wakes, us. None without any run."""
+    skipped included; `runs` have the lateness of its wakes, us. None without any run.
+    """
     if not runs:
         return None
     passed = np.floor(np.concatenate(runs) * 1e3 / period_ns)

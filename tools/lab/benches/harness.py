@@ -44,7 +44,8 @@ _Result = TypeVar("_Result")
 @dataclass(frozen=True)
 class Sample:
     """The raw measurements of one contestant in one case, such as "time-slice" at "200 B"; smaller
-    is better."""
+    is better.
+    """
 
     case: str
     who: str
@@ -114,7 +115,8 @@ def finished(
 ) -> subprocess.CompletedProcess[str]:
     """Run a program, `called` so in messages, to its end, with `text` as its input. Raises
     `Failure` if it takes longer than `bound_s`. Ends it, in order if it can, if this process is
-    interrupted."""
+    interrupted.
+    """
     pipe = subprocess.PIPE
     process = subprocess.Popen(
         argv,
@@ -138,7 +140,8 @@ def finished(
 @contextmanager
 def pinned(core: int, priority: int = 0) -> Iterator[None]:
     """Keep the calling process on a core, at a real-time priority if that is permitted, while the
-    context lasts."""
+    context lasts.
+    """
     cores = os.sched_getaffinity(0)
     try:
         pin(core)
@@ -180,7 +183,8 @@ class Comparison:
 
     def ratio(self, sample: Sample, figure: str = "median") -> float | None:
         """Return a figure of a sample divided by that of its baseline; None without one, or where
-        that is 0."""
+        that is 0.
+        """
         baseline = self._samples.get((sample.case, self.baselines.get(sample.case, "")))
         if baseline is None or not getattr(baseline, figure):
             return None

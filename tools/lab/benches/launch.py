@@ -1,5 +1,6 @@
 """Measures what a user waits for: a launch, short commands, and a rack's reaction to a board that
-is killed."""
+is killed.
+"""
 
 from __future__ import annotations
 

@@ -79,7 +79,8 @@ def measure(
 
 def compare(samples: Sequence[Sample], baseline: str) -> Comparison:
     """Return the comparison of these samples with one contestant, and how many simulated seconds a
-    second they are."""
+    second they are.
+    """
     speeds = [f"{one.case} {shown(1e3 / one.median)} ({one.who})" for one in samples]
     return Comparison(
         name="lockstep",
@@ -121,7 +122,8 @@ def run_bare(config: RackConfig, ticks: int) -> BareRun:
 
 def _check(rack: str, options: Sequence[object], folder: Path) -> int:
     """Record a rack in lockstep and compare it with its levels alone; return the ticks that it ran
-    for."""
+    for.
+    """
     words = ("run", rack, "--lockstep", *options, "--out", folder)
     rack_commands(None)[0].run(*words, bound_s=BOUND_S)
     recording = Recording(folder)

@@ -124,7 +124,8 @@ class RateFigures:
 @dataclass(frozen=True)
 class Machine(Comparison):
     """The figures of every rate, lowest first, and the lateness of the rack's fastest board `who`
-    next to `cyclictest`."""
+    next to `cyclictest`.
+    """
 
     who: str = ""
     is_fifo: bool = False
@@ -144,7 +145,8 @@ class Machine(Comparison):
     @property
     def verdict(self) -> Iterator[str]:
         """The answer in a few lines: whether the machine is fit, up to which rate, and why not
-        beyond."""
+        beyond.
+        """
         highest = self.highest_hz
         if not self.is_fifo:
             yield "not fit for real time: SCHED_FIFO is refused (see `ulimit -r`)"
@@ -263,7 +265,8 @@ def measure(
 
 class RackRun(NamedTuple):
     """One run of a contestant: the lateness of its wakes, us; of a rack also the counts of its
-    board's cycles, and why it ended early."""
+    board's cycles, and why it ended early.
+    """
 
     late_us: np.ndarray
     counts: Mapping[str, int] = MappingProxyType({})

@@ -80,7 +80,8 @@ CASES = tuple(Case(size, readers) for readers in READERS for size in SIZES)
 
 def measure(cases: Sequence[Case], rounds: int, progress: Progress) -> Comparison:
     """Measure every contestant that is installed in every case; the baseline of a case is its best
-    peer."""
+    peer.
+    """
     missing = {peer.name: absent_package(peer.name, peer.module) for peer in PEERS}
     present = [peer for peer in PEERS if not missing[peer.name]]
     progress.total(CASE_S * len(cases))
@@ -123,7 +124,8 @@ def _measure_case(case: Case, peers: Sequence[Peer], rounds: int) -> list[Sample
 
 def exchange(name: str, transport: Transport, lengths: dict[str, int]) -> Callable[[], float]:
     """Return a function that makes many exchanges through a transport, and returns the us that each
-    took. Raises `Failure` if a reader receives another message than the one sent."""
+    took. Raises `Failure` if a reader receives another message than the one sent.
+    """
     message, send, readers = transport
     for key, length in (("position", "joints"), ("velocity", "joints"), ("torque", "rest")):
         setattr(message, key, np.linspace(-9.0, 9.0, lengths[length]))
@@ -167,7 +169,8 @@ def _mailbox(protocol: Protocol, case: Case) -> Iterator[Transport]:
 
 def _reading(segment: Segment, box: MailboxSpec, task: str) -> Callable[[int], AnyMessage]:
     """Return a function that reads as a board does; without its checks on the writer, where no
-    machine code makes them."""
+    machine code makes them.
+    """
     inbox = open_inbox(segment, task)
     found = watched(segment, box.name, AlarmWriter(segment, task), ReadingTask(inbox))
     read = found.reader.read

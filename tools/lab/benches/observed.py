@@ -85,7 +85,8 @@ class CycleCount(NamedTuple):
 
 def count_cycles(tasks: Iterable[Mapping[str, int]]) -> CycleCount:
     """Return the cycles of several tasks or runs together; `tasks` are counts as in
-    `RunResult.tasks`."""
+    `RunResult.tasks`.
+    """
     counts = list(tasks)
     missed = sum(task["missed"] + task["skipped"] for task in counts)
     return CycleCount(missed, sum(task["due"] for task in counts))

@@ -76,7 +76,8 @@ def replay(folder: Path, ticks: int) -> list[float]:
 
 def _stretch(recording: Recording) -> tuple[int, int]:
     """Return first and last tick of the longest stretch without brakes; states are recorded at
-    both."""
+    both.
+    """
     status = f"{SERVO}.status"
     ticks = recording.signal(status, "tick")[recording.signal(status, "braked") == 0]
     stretches = np.split(ticks, np.flatnonzero(np.diff(ticks) != 1) + 1)

@@ -28,7 +28,8 @@ KEY = "rack"
 
 class Transport(NamedTuple):
     """Fill `message`, call `send` with a tick, then every reader with the same tick: each returns
-    what it received."""
+    what it received.
+    """
 
     message: AnyMessage
     send: Callable[[int], object]
@@ -37,7 +38,8 @@ class Transport(NamedTuple):
 
 class Peer(NamedTuple):
     """A contestant: `opened` gives it for a message type and so many readers; `module` must be
-    installed for it."""
+    installed for it.
+    """
 
     name: str
     module: str
@@ -94,7 +96,8 @@ def multiprocessing_pipe(dtype: np.dtype, readers: int) -> Iterator[Transport]:
 @contextmanager
 def horus_image(dtype: np.dtype, readers: int) -> Iterator[Transport]:
     """Send a grey image of one row through a HORUS topic: no other message of it takes any number
-    of bytes."""
+    of bytes.
+    """
     message = AnyMessage(dtype)
     namespace = f"rack_bench_{os.getpid()}"
     os.environ["HORUS_NAMESPACE"] = namespace
@@ -142,7 +145,8 @@ def _into(dtype: np.dtype, fetch: Callable[[memoryview], object]) -> Callable[[i
 @contextmanager
 def _iceoryx2_names() -> Iterator[tuple[Any, Any]]:
     """Give iceoryx2 and a node to open services with: files and shared memory have names while the
-    context lasts."""
+    context lasts.
+    """
     import iceoryx2
 
     iceoryx2.set_log_level(iceoryx2.LogLevel.Fatal)

@@ -1,5 +1,6 @@
 """The claims of the paper, section by section: its sentence, the experiments and the rule that
-judge it, and the reason of the ruling if it holds."""
+judge it, and the reason of the ruling if it holds.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
 """The page: claims of the paper with predictions, measurements and rulings, as data, as Markdown,
-and as HTML."""
+and as HTML.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +21,8 @@ from rack.tools.lab.reproduction.verdict import Check, ClaimVerdict, Ruling, des
 @dataclass(frozen=True)
 class Evidence:
     """One thing shown for a claim: comparisons, or text of fixed width. `source` is the command
-    that it comes from."""
+    that it comes from.
+    """
 
     source: str = ""
     checks: tuple[Check, ...] = ()

@@ -1,5 +1,6 @@
 """The whole reproduction: which experiments are still to be made, making them, and writing the
-page."""
+page.
+"""
 
 from __future__ import annotations
 

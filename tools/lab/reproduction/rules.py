@@ -129,7 +129,8 @@ def judge_replication() -> ClaimVerdict:
 
 def judge_communication(found: NasremRun, partitions: Sequence[PartitionFigures]) -> ClaimVerdict:
     """Compare the processor time of communication with what a second processor takes off one, ms a
-    second."""
+    second.
+    """
     communication = sum(task.communication_us / task.slice_ms for task in found.executors.values())
     loads = {one.partition: one.loads.values() for one in partitions}
     one, two = (loads[Partition("tight", cores)] for cores in (1, 2))
@@ -139,7 +140,8 @@ def judge_communication(found: NasremRun, partitions: Sequence[PartitionFigures]
 
 def judge_flow(found: NasremRun) -> ClaimVerdict:
     """Compare the commands and statuses of the levels with what the ticks of their writers
-    demand."""
+    demand.
+    """
     ways = [[box for box in found.due if box.endswith(way)] for way in (".command", ".status")]
     boxes = [box for way in ways for box in way]
     # A run may end before the last one is written.
@@ -189,7 +191,8 @@ def check_equations(verdicts: Iterable[EquationVerdict]) -> list[Check]:
 
 def judge_equation(number: str, found: NasremRun) -> ClaimVerdict:
     """Compare both sides in the worst cycle of every subject; within bounds, in 99 of 100
-    cycles."""
+    cycles.
+    """
     verdicts = [one for one in found.verdicts if one.measured.equation == number]
     return rule_on(
         ideal=check_equations(one.measured for one in verdicts),
@@ -200,7 +203,8 @@ def judge_equation(number: str, found: NasremRun) -> ClaimVerdict:
 
 def judge_sum(found: NasremRun) -> ClaimVerdict:
     """Compare the longest responses with the sum alone, ms; within bounds, with the sum and its
-    waits, which a missed cycle may prolong."""
+    waits, which a missed cycle may prolong.
+    """
     assert found.response is not None, "it is a hierarchy"
     ways = found.response.ways
     checks = [
@@ -218,7 +222,8 @@ def judge_sum(found: NasremRun) -> ClaimVerdict:
 
 def judge_background(behind: FigureRun, in_line: FigureRun) -> ClaimVerdict:
     """Count the cycles that are late while a level stores data in the background, and compare with
-    storing in the cycle."""
+    storing in the cycle.
+    """
     return rule_on(
         compare("blocks_stored", behind.tasks[PLANNER].jobs, ">=", 1),
         compare("stored_in_cycle_late_share", in_line.late(LEVEL), ">=", MOSTLY),
@@ -229,7 +234,8 @@ def judge_background(behind: FigureRun, in_line: FigureRun) -> ClaimVerdict:
 
 def judge_loose(plain: NetworkRun, later: NetworkRun) -> ClaimVerdict:
     """Compare the servo rack's cycles, and when it responds to the machine above, with a network
-    and with a slower one."""
+    and with a slower one.
+    """
     later_ms = 0.0
     if plain.response_ms is not None and later.response_ms is not None:
         later_ms = later.response_ms - plain.response_ms
@@ -267,7 +273,8 @@ def _compare_late(found: FigureRun, sign: str, name: str = "late_share") -> Chec
 
 def _undisturbed(found: FigureRun) -> list[Check]:
     """Return what a run needs to show the figure: an executor is late in almost all cycles, or in
-    none."""
+    none.
+    """
     late = found.late(LEVEL)
     return [compare("executor_late_share", late, "<=", STRAY)] if late <= MOSTLY else []
 
@@ -280,14 +287,16 @@ def judge_working(found: FigureRun) -> ClaimVerdict:
 
 def judge_failing(found: FigureRun, *shorter: FigureRun) -> ClaimVerdict:
     """Rule on a figure of which the paper says that it fails, with the shortest X that the paper
-    permits too."""
+    permits too.
+    """
     shortest = [_compare_late(run, ">", "shortest_X_late_share") for run in shorter]
     return rule_on(_compare_late(found, ">"), ideal=shortest, needs=_undisturbed(found))
 
 
 def check_planning(process_ms: float) -> tuple[Check, Check]:
     """Compare figure 2 with this X, ms, with both sentences on its planner: at least `LEAST_P_MS`
-    in each cycle, and a plan in the cycles permitted."""
+    in each cycle, and a plan in the cycles permitted.
+    """
     config = load(FIG2.config, settings_of(FIG2.config, process_ms))
     level = rack_timing(config, wire(config)).level(LEVEL)
     # As the pattern "RXWPU" reads, U too is in every cycle; for a plan to be done, it is once.
@@ -323,7 +332,8 @@ def judge_tables(found: TableRuns) -> ClaimVerdict:
 
 def judge_levels(found: NasremRun) -> ClaimVerdict:
     """Compare the rates of the levels with the paper's, or else with the config's, and the gaps
-    between their cycles with two periods: from there on a cycle was left out."""
+    between their cycles with two periods: from there on a cycle was left out.
+    """
     config = load(NAME)
     rates = check_done(found)
     gaps = []
@@ -349,7 +359,8 @@ def judge_switch(found: SwitchRun) -> ClaimVerdict:
 
 def judge_figure_5(found: Sequence[PartitionFigures]) -> ClaimVerdict:
     """Compare what levels miss by partition: do slow levels do with multitasking, and do fast ones
-    need more?"""
+    need more?
+    """
     is_slow = {
         one.level: figure5.region_of(one.cycle_s).name == "multitasking"
         for one in figure5.placed(load(NAME))
@@ -376,7 +387,8 @@ def judge_figure_5(found: Sequence[PartitionFigures]) -> ClaimVerdict:
 
 def judge_systems(names: Iterable[str], *found: TaskRun | TableRuns) -> ClaimVerdict:
     """Compare the responses in whole tasks of these systems with their bounds, ms; a missed cycle
-    may prolong them."""
+    may prolong them.
+    """
     runs = [run.disturbed if isinstance(run, TableRuns) else run for run in found]
     ways = {
         f"{name}_{way}_ms": response
@@ -438,7 +450,8 @@ def judge_rccl(rates_hz: Mapping[str, int], found: TaskRun) -> ClaimVerdict:
 
 def judge_predictable(found: ResponseRun) -> ClaimVerdict:
     """Compare responses with the tick predicted, and with equations 3.2 and 3.3; within bounds,
-    with the longest that the grid permits instead of the sum of eq. 3.3."""
+    with the longest that the grid permits instead of the sum of eq. 3.3.
+    """
     real = found.realtime
     upper, total = (
         [

@@ -1,5 +1,6 @@
 """Verdicts: comparisons of measured values with what a claim demands, and the ruling that results
-from them alone."""
+from them alone.
+"""
 
 from __future__ import annotations
 

@@ -30,7 +30,8 @@ tenth."""
 
 def main() -> None:
     """Attach to the rack that one line of JSON names, and record until stdin closes; another line
-    means: in a hurry."""
+    means: in a hurry.
+    """
     # Ctrl-C reaches the whole foreground group; but the launcher decides when the recording is
     # complete.
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):

@@ -1,5 +1,6 @@
 """The flight recorder: a recorder whose spool is in stretches, and forgets those that are old and
-near no occasion."""
+near no occasion.
+"""
 
 from __future__ import annotations
 
@@ -50,7 +51,8 @@ class FlightRecorder:
 
     def look(self, ring: str, rows: np.ndarray, lost: int) -> None:
         """Look for occasions in rows of a ring, before which some were lost: nobody knows what was
-        in those."""
+        in those.
+        """
         found = [self._words[System.TICK]] if lost else []
         for tick in (*found, *self._occasions.within(ring, rows)):
             self._mark(tick)

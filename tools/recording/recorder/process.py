@@ -1,5 +1,6 @@
 """The recorder process as its launcher sees it: spawned, never forked, so that no board inherits
-its threads."""
+its threads.
+"""
 
 from __future__ import annotations
 
@@ -103,7 +104,8 @@ class RecorderProcess:
 
     def attach(self, rack: str, port: int | None, words: memoryview | None = None) -> bool:
         """Record that rack, and serve a viewer on that port; return False if it has not begun in
-        time. With the `words` of a rack in lockstep, that waits for it, in any case."""
+        time. With the `words` of a rack in lockstep, that waits for it, in any case.
+        """
         self._request = encode_json([rack, str(self.folder), port]).encode() + b"\n"
         self._words = words
         self._ask()

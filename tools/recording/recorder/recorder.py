@@ -98,7 +98,8 @@ class SafeSink:
         tell: Callable[[str], None],
     ) -> Self | None:
         """Return the sink of the viewer's file, or of a viewer on a port; a flight recorder has no
-        such file: `rack replay` makes it of what is kept."""
+        such file: `rack replay` makes it of what is kept.
+        """
         if port is None and Retention.of(segment) is not None:
             return None
         # No run waits for the libraries of the viewer, which may take long, and for ever on a full
@@ -111,7 +112,8 @@ class SafeSink:
 
     def advance(self, tick: int, lost: Mapping[str, int]) -> None:
         """Pass on what waits, and the tick. A sink that was opened late is behind, and catches up
-        over several passes."""
+        over several passes.
+        """
         counted = dict(lost)
         self._waiting.append(lambda sink: sink.advance(tick, counted))
         if not self._opening.is_alive():
@@ -140,7 +142,8 @@ class SafeSink:
 
     def _hand_over(self, until: float = 0.0) -> None:
         """Make the calls that wait for the sink, as many as have come and more `until` then; there
-        are none to make of one that has failed."""
+        are none to make of one that has failed.
+        """
         while len(self._waiting) > self._late or (self._waiting and time.monotonic() < until):
             call = self._waiting.popleft()
             if (sink := self._sink) is not None:
@@ -244,7 +247,8 @@ class Recorder:
 
     def _report_progress(self) -> None:
         """In lockstep, tell the clock how far the recording is; reclaim the role of follower, lost
-        after a delay."""
+        after a delay.
+        """
         if self._is_follower:
             self._words[System.FOLLOWER_TICK] = self._safe_tick
             self._words[System.FOLLOWER_PID] = os.getpid()

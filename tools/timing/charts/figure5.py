@@ -1,5 +1,6 @@
 """Figure 5 of the paper, as text and picture: the kind of concurrency that suits the cycle of each
-level of a rack."""
+level of a rack.
+"""
 
 from __future__ import annotations
 
@@ -43,7 +44,8 @@ MEANINGS = {
 @dataclass(frozen=True)
 class Region:
     """A region of implementation: cycles up to `to_s`, s, its name in the figure, and the place it
-    gives a planner."""
+    gives a planner.
+    """
 
     name: str
     to_s: float
@@ -71,7 +73,8 @@ COUPLING = {"tight": "multitasking", "loose": "asynchronous"}
 @dataclass(frozen=True)
 class Placed:
     """A level in the figure: its cycle, s, the region of that cycle, its coupling, and a remark on
-    both."""
+    both.
+    """
 
     level: str
     cycle_s: float
@@ -95,7 +98,8 @@ def placed(config: RackConfig) -> list[Placed]:
 
 def together(levels: Sequence[Placed]) -> list[Placed]:
     """Return the levels, those of the same place in the figure as one: a board a joint needs one
-    line."""
+    line.
+    """
     return [Placed(**row) for row in merge_rows(map(vars, levels), "level")]
 
 

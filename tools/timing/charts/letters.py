@@ -1,5 +1,6 @@
 """A Gantt chart in letters, as in the paper's figures: a row for each lane, a unit function in each
-column."""
+column.
+"""
 
 from __future__ import annotations
 
@@ -60,7 +61,8 @@ def lines(panel: Panel, column_ns: int) -> Iterator[str]:
 
 def column_for(window_ns: int, shortest_ns: int | None) -> int:
     """Return the time of a column, ns: 1, 2 or 5 times a power of ten; it shows the shortest part
-    if possible."""
+    if possible.
+    """
     steps: list[int] = [digit * 10**power for power in range(3, 12) for digit in (1, 2, 5)]
     fits = next((step for step in steps if window_ns <= COLUMNS * step), steps[-1])
     seen = max(
@@ -87,7 +89,8 @@ def _row(chart: Chart, lane: Lane, column_ns: int) -> str:
 
 def _marks(panel: Panel, lane: Lane, column_ns: int) -> str:
     """Return "|" where cycles begin and "!" where a deadline was missed; empty when there are
-    none."""
+    none.
+    """
     chart = panel.chart
     row = [" "] * (-(-(chart.end_ns - chart.start_ns) // column_ns) + 1)
     if lane.cycle_ns >= CYCLE_COLUMNS * column_ns:
@@ -109,7 +112,8 @@ def label_row(labels: Iterable[tuple[int, str]]) -> str:
 
 def numbered_frames(panel: Panel, character_ns: int, prefix: str = "|") -> list[tuple[int, int]]:
     """Return numbers and starts, ns, of the minor frames to be labelled: far enough apart for
-    `prefix` and number."""
+    `prefix` and number.
+    """
     frames = panel.frames
     widest_ns = max(len(f"{prefix}{number}") for number in frames) * character_ns
     steps = (digit * 10**power for power in count() for digit in (1, 2, 5))
@@ -132,7 +136,8 @@ def label_times(panel: Panel, column_ns: int) -> range:
 
 def step_for(panel: Panel, narrowest_ns: int) -> int:
     """Return the time between two labels of the axis, ns: the cycle of a lane if not too short nor
-    too long."""
+    too long.
+    """
     longest_ns = (panel.chart.end_ns - panel.chart.start_ns) // 2
     cycles = sorted(lane.cycle_ns for lane in panel.lanes)
     step = next((cycle for cycle in cycles if narrowest_ns <= cycle <= longest_ns), None)

@@ -1,5 +1,6 @@
 """The Gantt chart of a run, from its trace: spans of unit functions, cut where a higher priority
-had the core."""
+had the core.
+"""
 
 from __future__ import annotations
 
@@ -72,7 +73,8 @@ class TracedRun:
 
     def middle_ns(self, task: TimedTask) -> int:
         """Return the first release of a task, or of its plans, in the second half of the run; 0
-        without one."""
+        without one.
+        """
         ticks = self._records[task.name][0]["tick"]
         at = int(np.searchsorted(ticks, self.end_ns // self.config.tick_ns // 2))
         return int(ticks[at]) * self.config.tick_ns if at < len(ticks) else 0
@@ -120,7 +122,8 @@ class TracedRun:
     @cached_property
     def _records(self) -> dict[str, tuple[np.ndarray, int]]:
         """The records of every task, only those of plans for a planner, and its longest response,
-        ns."""
+        ns.
+        """
         found = {}
         for task in self.tasks:
             rows = self.recording.trace(task.name)
@@ -176,7 +179,8 @@ class _Traced:
 
 def _spans(traced: Sequence[_Traced]) -> Iterator[Span]:
     """Yield the spans of one core by falling priority, each without the time taken by those above
-    it."""
+    it.
+    """
     levels: dict[tuple[int, bool], list[tuple[TimedTask, int, Unit, Stretch]]] = defaultdict(list)
     waking: dict[int, list[Stretch]] = defaultdict(list)
     for found in traced:

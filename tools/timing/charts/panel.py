@@ -1,5 +1,6 @@
 """A chart with its lanes, late jobs and patterns: of a schedule, or as measured; and the arithmetic
-of stretches."""
+of stretches.
+"""
 
 from __future__ import annotations
 
@@ -54,7 +55,8 @@ class Panel:
     @property
     def frames(self) -> dict[int, int]:
         """The start of every minor frame that begins in the window, ns, by number from the start of
-        the run."""
+        the run.
+        """
         if not self.frame_ns:
             return {}
         numbers = range(

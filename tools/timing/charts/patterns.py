@@ -96,7 +96,8 @@ def lanes_of(tasks: Sequence[TimedTask]) -> tuple[Lane, ...]:
 
 class Patterns(NamedTuple):
     """How often each pattern occurred in a lane: over the cycles of a plan, and in single cycles
-    without one."""
+    without one.
+    """
 
     plans: Counter[str]
     cycles: Counter[str]
@@ -115,7 +116,8 @@ class Patterns(NamedTuple):
 @dataclass(frozen=True)
 class Detail:
     """The longest stretches that patterns leave out, ns: of each unit function, and of an idle
-    core."""
+    core.
+    """
 
     short_ns: Mapping[Unit, int] = field(default_factory=dict)
     gap_ns: int = 0
@@ -123,7 +125,8 @@ class Detail:
     @classmethod
     def measured(cls, lane: Lane, median_ns: Mapping[Unit, int]) -> Detail:
         """Return the detail of the measured patterns of a lane, from the medians of its unit
-        functions."""
+        functions.
+        """
         longest = round(SHORT * lane.cycle_ns)
         short = {unit: min(longest, round(REMNANT * median)) for unit, median in median_ns.items()}
         if lane.is_tight:
@@ -159,7 +162,8 @@ def patterns(chart: Chart, lane: Lane, within: Stretch, detail: Detail) -> Patte
 
 def _beginnings(chart: Chart, lane: Lane, within: Stretch) -> Iterator[tuple[int, int, bool]]:
     """Yield start, number of cycles and True for every plan; start, 1 and False for every cycle
-    without one."""
+    without one.
+    """
     slices = lane.slice_ns // lane.cycle_ns
     plans = {job.release_ns for job in chart.jobs if lane.planner and job.task == lane.planner}
     planned = {plan + at * lane.cycle_ns for plan in plans for at in range(slices)}
@@ -172,7 +176,8 @@ def _beginnings(chart: Chart, lane: Lane, within: Stretch) -> Iterator[tuple[int
 
 def _order(spans: Sequence[Span], lane: Lane, within: Stretch, detail: Detail) -> str:
     """Return the order of the unit functions within a stretch, as in "R X W P -"; `spans` are those
-    in it, in the order of time."""
+    in it, in the order of time.
+    """
     stretches: list[tuple[Unit | None, int]] = []
     busy_until = within[0]
     for span in spans:

@@ -64,7 +64,8 @@ FRAME_CHARACTER = 1 / 120
 
 def save(panels: Sequence[Panel], title: str, stem: Path) -> list[Path]:
     """Draw the panels, one above the other on one axis of time, into `stem`.png and .svg; return
-    their paths."""
+    their paths.
+    """
     lanes = [len(panel.lanes) for panel in panels]
     height = LANE_IN * sum(lanes) + 0.45 * len(panels) + 1.2
     paths = paths_of(stem)

@@ -59,7 +59,8 @@ class WindowOptions:
 
 def shown_task(tasks: Sequence[TimedTask]) -> TimedTask:
     """Return the task whose cycles count: the slowest that fits into a chart, if possible a tightly
-    coupled planner."""
+    coupled planner.
+    """
     tasks = [task for task in tasks if task.role != "clock"]
     fastest = min(task.every_ns for task in tasks)
     cores = {(task.board, task.core) for task in tasks if task.role == "executor"}

@@ -52,7 +52,8 @@ Found = TypeVar("Found")
 
 class Lacking(Failure):
     """The machine lacks what an experiment needs: its claims cannot be tested here, which is no
-    failure."""
+    failure.
+    """
 
 
 class Workshop:
@@ -101,7 +102,8 @@ class Workshop:
 
     def run(self, label: str, config: RackConfig, seconds: float | None = None) -> Recorded:
         """Run a rack and return how it went and its recording, which stays in the folder; one of an
-        unfinished run is replaced."""
+        unfinished run is replaced.
+        """
         folder = self.folder / RUNS / label
         shutil.rmtree(folder, ignore_errors=True)
         return record(config, seconds, folder, self.share)
@@ -160,7 +162,8 @@ def depends() -> Document:
 @dataclass(frozen=True)
 class Kept:
     """A result that is kept: what was found, when, in which time, and what it depends on; or why
-    nothing can be found on this machine."""
+    nothing can be found on this machine.
+    """
 
     found: Any
     took_s: float

@@ -86,7 +86,8 @@ class FigureRack:
 
 def settings_of(name: str, process_ms: float) -> tuple[str, ...]:
     """Return the settings with which the executor of a figure takes this X, ms, in its budget and
-    on its board."""
+    on its board.
+    """
     board = load(name).board[LEVEL]
     assert board.budget is not None, "every figure has a budget"
     own_ms = board.budget.process_ms - board.params["process_ms"]

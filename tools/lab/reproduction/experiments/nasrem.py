@@ -1,5 +1,6 @@
 """NASREM: its whole task in real time, with every equation put to the run; the same messages in
-lockstep and in real time; losses and how soon they are over; and moves by a promised time."""
+lockstep and in real time; losses and how soon they are over; and moves by a promised time.
+"""
 
 from __future__ import annotations
 
@@ -126,7 +127,8 @@ def _executor(cycles: Cycles, rack: RackTiming) -> ExecutorCycles:
 @dataclass(frozen=True)
 class ComparedRun:
     """The digest of a run, the tick of its first missed deadline, and where it diverges from the
-    first run."""
+    first run.
+    """
 
     mode: str
     digest: str
@@ -234,7 +236,8 @@ DEADLINE = Experiment("goto", "goto in soft time, and by a time", GOTO_S, GotoRu
 
 def _goto(workshop: Workshop, label: str, by_s: float | None) -> GotoRun:
     """Run GOTO A, above the goal of the first object that the program moves, then GOTO B, the
-    start."""
+    start.
+    """
     x, y, z = next(action["to"] for action in load(NAME).task["action"] if "to" in action)
     by = "" if by_s is None else f", by = {by_s!r}"
     place = [x, y, round(z + ABOVE_M, 6)]

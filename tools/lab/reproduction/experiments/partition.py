@@ -74,7 +74,8 @@ class TaskFigures:
 @dataclass(frozen=True)
 class PartitionFigures:
     """The measurements of one partition; `loads` are the parts of each core's time that its tasks
-    used."""
+    used.
+    """
 
     partition: Partition
     tasks: tuple[TaskFigures, ...]

@@ -112,7 +112,8 @@ def list_commands() -> list[CommandConfig]:
 
 def first_difference(first: Recording, second: Recording) -> int | None:
     """Return the first tick at which the torques of two runs in lockstep differ in any bit, over
-    the ticks that both have; None if they never do."""
+    the ticks that both have; None if they never do.
+    """
     torques = [run.signal(STATUS, "torque").view(np.uint64) for run in (first, second)]
     # In lockstep the level writes in every cycle: messages of the same number have the same tick.
     length = min(map(len, torques))

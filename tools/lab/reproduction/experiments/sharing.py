@@ -1,5 +1,6 @@
 """Boards that share processors and the backplane: chains of boards, with and without locks, and
-ways of waiting for a cycle."""
+ways of waiting for a cycle.
+"""
 
 from __future__ import annotations
 
@@ -89,7 +90,8 @@ CHAINS = Experiment(
 @dataclass(frozen=True)
 class Waits:
     """The median of how late an empty board starts its cycles, us, if it blocks until them, and if
-    it polls."""
+    it polls.
+    """
 
     blocking_us: float
     polling_us: float

@@ -43,7 +43,8 @@ LAUNCH_S = 3.0
 @dataclass(frozen=True)
 class SwitchRun:
     """The context switch t_cs of this machine, us, half of both switches around each wake-up that
-    interrupted the planner; and the one that the config assumes, us."""
+    interrupted the planner; and the one that the config assumes, us.
+    """
 
     switch_us: Distribution
     assumed_us: float
@@ -72,7 +73,8 @@ class _Shared(NamedTuple):
 
 def measure_switch() -> Distribution:
     """Measure on the last core of this machine, woken from the first. Raises `Failure` if the
-    processes cannot run at real-time priorities."""
+    processes cannot run at real-time priorities.
+    """
     cores = sorted(os.sched_getaffinity(0))
     spawn = multiprocessing.get_context("spawn")
     gaps, awake = spawn.RawArray("q", 2 * WAKES), spawn.RawArray("q", 2 * WAKES)

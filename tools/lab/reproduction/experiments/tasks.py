@@ -1,5 +1,6 @@
 """Whole tasks of the paper's systems in real time: each is one rack, but Brown's, which is two
-joined by a network."""
+joined by a network.
+"""
 
 from __future__ import annotations
 
@@ -78,7 +79,8 @@ class SystemResponse:
 
 def response_from(found: Mapping[str, Any] | None) -> SystemResponse | None:
     """Return the response in a report; None without a hierarchy, or if it crosses racks, for which
-    there is no bound."""
+    there is no bound.
+    """
     if found is None or found["crosses_racks"]:
         return None
     ways = {way: _way_response(found[way]) for way in ("command", "status")}
@@ -161,7 +163,8 @@ class TableRun(TaskRun):
 @dataclass(frozen=True)
 class TableRuns:
     """NIST's controller before NASREM, of executors with state tables: with what moves in the cell,
-    in real time, and without."""
+    in real time, and without.
+    """
 
     disturbed: TableRun
     undisturbed: TableRun
@@ -259,7 +262,8 @@ def _renamed(workshop: Workshop, name: str, more: Sequence[str]) -> RackConfig:
 
 def _response_ms(general: Recording, servo: Recording) -> float | None:
     """Return the time from the first message that wants a modification to the status that says it
-    is in."""
+    is in.
+    """
     wanted_ns = _first_ns(general, "modifications.command", "wanted")
     is_in_ns = _first_ns(servo, "shoulder.status", "reason")
     return None if wanted_ns is None or is_in_ns is None else 1e-6 * (is_in_ns - wanted_ns)
@@ -267,7 +271,8 @@ def _response_ms(general: Recording, servo: Recording) -> float | None:
 
 def _first_ns(recording: Recording, box: str, field: str) -> int | None:
     """Return when the first message that names the modification is visible: on CLOCK_MONOTONIC, in
-    lockstep in the simulated time of both."""
+    lockstep in the simulated time of both.
+    """
     named = [MODIFICATION in str(text) for text in recording.signal(box, field)]
     ticks = recording.signal(box, "visible_at")[named]
     if not len(ticks):
