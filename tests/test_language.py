@@ -1,0 +1,80 @@
+"""Texts of the product avoid the patterns that made them hard to read.
+
+ruff checks the form of docstrings. These patterns are not a matter of form: each made a reader
+guess what the sentence is about.
+"""
+
+from __future__ import annotations
+
+import ast
+import io
+import re
+import tokenize
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+SOURCES = sorted(
+    path
+    for folder in ("backplane", "boards", "configs", "levels", "tools")
+    for path in (ROOT / folder).rglob("*.py")
+)
+PATTERNS = {
+    "a clause in place of a noun": re.compile(r"(What|Where|Who|How|Which|Whose) (?!.*\?)"),
+    "a value and its meaning without a sentence": re.compile(r".*; (None|empty|0|-1|False|True): "),
+    "'say whether' in place of 'return True if'": re.compile(r".*\bSay whether\b"),
+}
+"""Matched from the beginning of a text."""
+SHORTEST_MESSAGE = 6
+"""A string of at least as many words is read by people."""
+
+
+def texts(source: str) -> Iterator[tuple[int, str]]:
+    """Yield the line and the words of each docstring, comment and message of a file."""
+    documentation = set()
+    for node in ast.walk(ast.parse(source)):
+        match node:
+            case ast.Expr(ast.Constant(str(text)) as constant):
+                documentation.add(constant)
+                yield node.lineno, " ".join(text.split())
+            case ast.Constant(str(text)) if node not in documentation:
+                if len(text.split()) >= SHORTEST_MESSAGE:
+                    yield node.lineno, " ".join(text.split())
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type == tokenize.COMMENT:
+            yield token.start[0], token.string.lstrip("# ")
+
+
+def hits(source: str) -> list[str]:
+    return [
+        f"{line}: {name}: {text}"
+        for line, text in texts(source)
+        for name, pattern in PATTERNS.items()
+        if pattern.match(text)
+    ]
+
+
+@pytest.mark.slow
+def test_texts_avoid_patterns_that_hide_their_subject() -> None:
+    assert not [
+        f"{path.relative_to(ROOT)}:{hit}" for path in SOURCES for hit in hits(path.read_text())
+    ]
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        '"""What a sample may be off by."""',
+        "x = 1\n# Say whether it is new.",
+        "x = 1  # ticks; None: for ever",
+        'raise ValueError("the bound in ticks of a cycle; 0: none is given")',
+    ],
+)
+def test_each_pattern_is_noticed(source: str) -> None:
+    assert hits(source)
+
+
+def test_a_question_is_no_hit() -> None:
+    assert not hits('"""What does a cycle cost?"""')
