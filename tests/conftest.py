@@ -6,6 +6,7 @@ import atexit
 import gc
 import os
 import signal
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from functools import partial
@@ -15,6 +16,7 @@ from pathlib import Path
 import pytest
 
 from rack.boards.crate import line
+from rack.tools.commands.new import TEMPLATES
 from rack.tools.recording.recorder import process as recorder_process
 from tests import warm
 from tests.machine import stolen, turn
@@ -155,3 +157,12 @@ def write(tmp_path: Path) -> Callable[[str, str], Path]:
         return path
 
     return write_file
+
+
+@pytest.fixture
+def without_templates(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Hide the templates of `rack new`, which other tests may have made importable."""
+    folders = [folder for folder in sys.path if not Path(folder).is_relative_to(TEMPLATES)]
+    monkeypatch.setattr(sys, "path", folders)
+    for kind in ("level", "servo", "planner"):
+        monkeypatch.delitem(sys.modules, f"my_{kind}", raising=False)

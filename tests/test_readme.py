@@ -70,6 +70,7 @@ def python(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("without_templates")
 @pytest.mark.parametrize(("line", "status"), COMMANDS.items(), ids=COMMANDS)
 def test_command_of_the_pages_works(line: str, status: int, tmp_path: Path) -> None:
     ended = rack(*words_of(line.split()[1:]), folder=tmp_path)

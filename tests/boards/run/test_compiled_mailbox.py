@@ -227,6 +227,7 @@ def test_machine_code_leaves_every_byte_and_verdict_as_python_does(
 
 
 @pytest.mark.thorough
+@pytest.mark.timeout(600)
 @settings(max_examples=1000, deadline=None)
 @given(PROTOCOLS, RATES, st.lists(OPERATIONS, min_size=40, max_size=120))
 def test_machine_code_leaves_every_byte_and_verdict_as_python_does_at_length(

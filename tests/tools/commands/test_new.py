@@ -28,16 +28,7 @@ def name() -> str:
     return f"soft_touch_{os.getpid()}_{next(NUMBERS)}"
 
 
-@pytest.fixture
-def _without_templates(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Hide the templates, which other tests of this process may have made importable."""
-    own = [place for place in sys.path if not Path(place).is_relative_to(TEMPLATES)]
-    monkeypatch.setattr(sys, "path", own)
-    for kind in KINDS:
-        monkeypatch.delitem(sys.modules, f"my_{kind}", raising=False)
-
-
-@pytest.mark.usefixtures("_without_templates")
+@pytest.mark.usefixtures("without_templates")
 @pytest.mark.parametrize("kind", KINDS)
 def test_it_writes_a_class_a_config_and_a_test_with_the_users_name(
     kind: str, name: str, tmp_path: Path
