@@ -170,7 +170,10 @@ class Supervisor:
         for rung in self.alarms.drain():
             self._journal.keep(rung.event)
         words = self.segment.words
-        stop = words[System.STOP_TICK] or words[System.TICK] + 1
+        stop = words[System.TICK] + 1
+        if planned := words[System.STOP_TICK]:
+            # A clock that did not react to a request to stop has not reached the planned end.
+            stop = min(stop, planned)
         if not 0 <= stop < MOST_TICKS:
             raise DamageError(f"a run of {stop} ticks")
         clock = self.plan.clock(None)

@@ -111,6 +111,20 @@ def test_a_stopped_crate_does_not_stop_the_run_nor_its_end(
 
 
 @pytest.mark.slow
+def test_a_run_that_was_stopped_has_the_ticks_that_its_clock_made(config: MakeConfig) -> None:
+    planned_s = 10_000.0
+    with Rack(config("clock.mode=lockstep", NEVER)) as rack:
+        rack.start(planned_s)
+        wait_until(lambda: rack.segment.words[System.TICK] > 20)
+        # The clock waits for this task, and does not see the request to stop.
+        os.kill(process_of(rack, "wave"), signal.SIGSTOP)
+        rack.stop("test")
+        outcome = end_of(rack)
+        assert outcome.cause == "stopped"
+        assert outcome.ticks == rack.segment.words[System.TICK] + 1
+
+
+@pytest.mark.slow
 def test_a_level_that_raises_is_reported_with_its_reason(config: MakeConfig) -> None:
     with Rack(config("board.wave.params={ trouble = 'raise', at = 30 }", NEVER)) as rack:
         rack.start()
