@@ -153,14 +153,14 @@ def _cases(state: str, rows: Mapping[int, RowConfig], vocabulary: Vocabulary) ->
         yield f"hole: '{state}' has {len(uncovered) - MAX_HOLES} more"
 
 
-def without(box: Box, taken: Box) -> Sequence[Box]:
+def without(box: Box, removed: Box) -> Sequence[Box]:
     """Return the cases of `box` that are not in `removed`, as disjoint boxes.
 
     Both boxes must have the same conditions.
     """
     pieces = []
     rest = dict(box)
-    for condition, values in taken.items():
+    for condition, values in removed.items():
         outside = rest[condition] - values
         inside = rest[condition] & values
         if not inside:

@@ -88,7 +88,7 @@ class MoveTable(StateTableExecutor):
             # Whether the objects are sensed.
             "world": ("seen", "unseen"),
             # The object to pick is there while it rests where it was sensed for the newest `move`.
-            # A place is always there.
+            # For a place it is always `there`.
             "target": ("there", "displaced", "moving"),
             # Whether the object put down last rests at its place.
             "support": ("there", "elsewhere"),

@@ -162,7 +162,7 @@ class StateTableExecutor(Executor):
         self._since: int | None = None
         self.use(next(iter(self.tables)))
         self.orders = Orders(self.commands)
-        self.detail = ""  # reason given by the level below, appended to that of a row
+        self.detail = ""  # reason given by the level below, appended to a row's reason
         self.resting = True  # no motion commanded by this level is under way
         self._newest = WordCommand(False, 0, "")
         self._taken = self._newest  # command in force
@@ -286,7 +286,7 @@ class StateTableExecutor(Executor):
         self._since = tick if self._since is None else self._since
         values[LATE] = YES_NO[(tick - self._since) * self.context.tick_s > self.table.patience_s]
         if self.vocabulary.commands:
-            # Compare without the words: those of one command differ only if an edited table knows
+            # Compare without the words. They differ for one command only if an edited table knows
             # other commands.
             is_new = self._newest[:2] != self._taken[:2] and self._newest.serial > 0
             command = self._newest if is_new else self._taken

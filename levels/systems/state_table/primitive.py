@@ -102,7 +102,7 @@ class PrimitiveTable(StateTableExecutor):
             # `empty` means that the gripper has closed on nothing.
             "gripper": ("moving", "open", "empty", "holds"),
         },
-        # Move the joints straight to those of the command; work the gripper.
+        # Move the joints straight to the commanded positions; work the gripper.
         commands={"move": (), "open": (), "close": ()},
         actions={"begin": (), "halt": (), "open": (), "close": ()},
         plan=PrimitivePlanConfig,
