@@ -33,7 +33,7 @@ class RackCommand:
 
     Attributes:
         name: Name of the tree.
-        argv: Program and arguments that precede those of the command.
+        argv: Program and arguments that precede the arguments of `rack`.
         environment: All environment variables of the command.
     """
 

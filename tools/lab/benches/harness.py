@@ -129,7 +129,7 @@ def finished(
         label: Name of the program in error messages.
         argv: Program and arguments.
         timeout_s: Longest permitted time, s.
-        environment: All of its environment variables. None for those of this process.
+        environment: All of its environment variables. None to inherit them.
         input_text: Text for its standard input.
 
     Returns:

@@ -104,7 +104,7 @@ def test_calls_become_requests_in_their_order_and_wait_ends_with_the_last() -> N
     assert not arm.wait(until=lambda: arm.done(first))
     assert not arm.done(last)
     with pytest.raises(
-        LevelError, match=r"line: body = block9: not in the scene; permitted: block1, "
+        LevelError, match=r"line: body = block9: not in the scene; its bodies are block1, "
     ):
         arm.line((0.0, 0.0, 0.1), body="block9")
 

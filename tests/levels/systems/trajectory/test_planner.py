@@ -138,7 +138,7 @@ def test_tool_goals_become_joint_positions_near_those_before() -> None:
     [
         (
             {"do": "move", "joints": [0.0]},
-            "task.step[0].joints = [0.0]: 1 values; permitted: 6, one per joint",
+            "task.step[0].joints = [0.0]: has 1 values; must have 6, one per joint",
         ),
         (
             {"do": "line", "position": [0, 0, 0], "body": "car"},

@@ -56,9 +56,9 @@ def test_a_tree_without_an_environment_of_its_own_is_refused_in_one_line(tmp_pat
     bare = tree_of(tmp_path / "bare", tmp_path)
     (bare / ".venv" / "bin" / "python").unlink()
     mistakes = {
-        tmp_path / "nowhere": "not a checkout of rack: it has no tools/cli.py",
-        bare: f"no environment .venv; to make it: make -C {bare} .venv/installed",
-        tree_of(tmp_path / "copied", ROOT): f"its .venv is that of {ROOT}; to make its own: make",
+        tmp_path / "nowhere": "is not a checkout of rack: it has no tools/cli.py",
+        bare: f"has no environment .venv; to create it: make -C {bare} .venv/installed",
+        tree_of(tmp_path / "copied", ROOT): f"its .venv belongs to {ROOT}; to renew it: make",
     }
     for tree, reason in mistakes.items():
         with pytest.raises(Failure) as refused:
