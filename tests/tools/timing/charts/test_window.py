@@ -59,8 +59,8 @@ def asked(from_ms: float | None, to_ms: float | None) -> WindowOptions:
 @pytest.mark.parametrize(
     ("from_ms", "to_ms", "extent_ms", "message"),
     [
-        (90.0, 95.0, 80, "90 to 95 ms: outside the run, which lasts from 0 to 80 ms"),
-        (70.0, 81.0, 80, "70 to 81 ms: outside the run"),
+        (90.0, 95.0, 80, "90 to 95 ms: is outside the run, which lasts from 0 to 80 ms"),
+        (70.0, 81.0, 80, "70 to 81 ms: is outside the run"),
         (9.0, 9.0, 80, "9 to 9 ms: --to-ms must be later than --from-ms"),
         # Nobody could read that.
         (0.0, 5000.1, 9000, "a chart shows at most 2000 cycles of 'servo', 5000 ms"),
