@@ -1,4 +1,4 @@
-"""Figure 5: levels among the regions of implementation, by their cycle."""
+"""Figure 5: levels in the regions of implementation by their cycles."""
 
 from __future__ import annotations
 
