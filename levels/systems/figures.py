@@ -68,14 +68,12 @@ class FigureLoop(Executor):
 
     def process(self, tick: int) -> None:
         """Write the status, then consume X. Time while preempted does not count."""
-        end_ns = (
-            process_time_ns() + self._times_ns[tick // self.context.every % len(self._times_ns)]
-        )
+        end = process_time_ns() + self._times_ns[tick // self.context.every % len(self._times_ns)]
         status = self.status
         status.state = State.EXECUTING
         status.cycle = tick
         status.plan = self.plan_in_use
-        compute_until(end_ns)
+        compute_until(end)
 
 
 class FigureExecutor(FigureLoop):

@@ -53,6 +53,7 @@ def system_response(recording: Recording) -> Document | None:
 
 
 def _response(recording: Recording, rack: RackTiming, chains: ParallelChains) -> Document:
+    """Return the response along parallel chains in both directions as plain data."""
     tick_ms = rack.clock_ns * 1e-6
     return {
         "subject": response_subject(rack, chains),

@@ -134,6 +134,7 @@ class OperatorResponse:
         return [self._row(level, path) for level, path in self.paths.items()]
 
     def _row(self, level: str, path: CommandPath) -> Document:
+        """Return the figures of one level, ms of simulated time."""
         commands = [c for c in self.measured if c.level == level]
         ms = np.array([self.ticks(c) for c in commands]) * self.tick_ms
         waits_ms = np.array([c.sampled - c.given for c in commands]) * self.tick_ms
@@ -283,9 +284,9 @@ def show(recording: Recording, folder: Path, as_json: bool) -> bool:
     """
     response = response_of(recording)
     if response is None:
-        why = "no operator commanded a level of its hierarchy"
         raise Failure(
-            f"{recording.folder}: {why}; see 'rack command' and [[command]]",
+            f"{recording.folder}: no operator commanded a level of its hierarchy;"
+            " see 'rack command' and [[command]]",
             2,
         )
     folder.mkdir(parents=True, exist_ok=True)

@@ -65,11 +65,10 @@ class Repair:
             failing = ", ".join(
                 dict.fromkeys(f"{verdict.equation} of {verdict.subject}" for verdict in self.left)
             )
-            tried = (
-                f"other priorities and cores, cycles and plans up to {MAX_FACTOR} times as long,"
-                " also for others"
+            lines.append(
+                f"no change helps with {failing}; tried: other priorities and cores, cycles and"
+                f" plans up to {MAX_FACTOR} times as long, also for others"
             )
-            lines.append(f"no change helps with {failing}; tried: {tried}")
         return lines
 
     def document(self) -> Document:

@@ -330,8 +330,7 @@ class StateTableExecutor(Executor):
         last = self.last_status.message
         self.status.copy_from(last)
         self.state = last.in_state
-        table = last.table if last.table in self.tables else self.table_name
-        self.use(table)
+        self.use(last.table if last.table in self.tables else self.table_name)
         self._recalled = answered(last)
         self._done = last.done
         self._taken = WordCommand(last.ordered > 0, last.ordered or last.echo, last.words)

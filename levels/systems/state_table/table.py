@@ -95,6 +95,7 @@ def phrases(verbs: Phrases, lexicon: Lexicon) -> Iterator[str]:
 
 
 def _words(parameter: str | Values, lexicon: Lexicon) -> Sequence[str]:
+    """Return the permitted words of a parameter, which may be the name of a set."""
     return lexicon[parameter] if isinstance(parameter, str) else parameter
 
 

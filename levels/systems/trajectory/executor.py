@@ -209,6 +209,7 @@ class TrajectoryExecutor(Executor):
         self._orders.report(status, agenda.rests_on)
 
     def _reason_to_wait(self) -> str:
+        """Return why motion does not continue. Empty if it does."""
         if not self._boards.in_step:
             return self._boards.awaited
         if self._orders.stands:

@@ -51,8 +51,7 @@ def apart(work: Callable[_P, _R], *args: _P.args, **kwargs: _P.kwargs) -> _R:
         answer, error = own_end.recv()
     except EOFError:
         process.join()
-        why = f"the process that measures ended with status {process.exitcode}"
-        raise Failure(why) from None
+        raise Failure(f"the process that measures ended with status {process.exitcode}") from None
     finally:
         process.kill()
         process.join()

@@ -55,8 +55,8 @@ class RackCommand:
         argv = [*self.argv, *map(str, arguments)]
         completed = finished(label, argv, bound_s, self.environment)
         if completed.returncode:
-            lines = [line for line in completed.stderr.splitlines() if line.strip()]
-            messages = lines or [f"exit status {completed.returncode}"]
+            lines = filter(str.strip, completed.stderr.splitlines())
+            messages = [f"exit status {completed.returncode}", *lines]
             raise Failure(f"{label}: {messages[-1]}")
         return completed.stdout
 

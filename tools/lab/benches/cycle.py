@@ -189,8 +189,9 @@ def costs(
     if physics_us:
         samples.append(Sample(COMPARED, PHYSICS, tuple(physics_us), "us"))
     baselines = {COMPARED: PHYSICS} if other is None else dict.fromkeys(cases, other)
-    title = "Processor time of a board's cycle"
-    return CycleCosts("cycle", title, tuple(samples), baselines, parts=parts)
+    return CycleCosts(
+        "cycle", "Processor time of a board's cycle", tuple(samples), baselines, parts=parts
+    )
 
 
 def parts_of(cycles: Cycles) -> dict[str, np.ndarray]:

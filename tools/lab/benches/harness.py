@@ -240,6 +240,7 @@ class Comparison:
         }
 
     def _figures(self, sample: Sample) -> dict[str, Any]:
+        """Return the statistics of a sample and its ratios to the baseline."""
         names = ("case", "who", "unit", "count", *FIGURES)
         ratios = {"ratio": self.ratio(sample), "p99_ratio": self.ratio(sample, "p99")}
         return {name: getattr(sample, name) for name in names} | ratios

@@ -68,8 +68,9 @@ def measure(
     baselines = dict.fromkeys(cases, INTERPRETER)
     if against is not None:
         baselines[LAUNCH] = trees[-1].name
-    title = "launches, short commands, and reactions to a kill"
-    return Comparison("launch", title, tuple(samples), baselines)
+    return Comparison(
+        "launch", "launches, short commands, and reactions to a kill", tuple(samples), baselines
+    )
 
 
 def _measure_commands(

@@ -102,8 +102,9 @@ def compare(samples: Sequence[Sample], baseline: str) -> Comparison:
 
 def _run(command: RackCommand, rack: str, options: Sequence[object]) -> float:
     """Run a rack by a command, and return the time of a simulated second, ms."""
-    words = ("run", rack, "--lockstep", "--no-record", "--json", *options)
-    result = json.loads(command.run(*words, bound_s=BOUND_S))
+    result = json.loads(
+        command.run("run", rack, "--lockstep", "--no-record", "--json", *options, bound_s=BOUND_S)
+    )
     return _ms_a_second(rack, result["wall_s"], result["outcome"]["ticks"])
 
 
@@ -146,8 +147,8 @@ def _check(rack: str, options: Sequence[object], folder: Path) -> int:
     Raises:
         Failure: If the levels alone did different work.
     """
-    words = ("run", rack, "--lockstep", *options, "--out", folder)
-    rack_commands(None)[0].run(*words, bound_s=BOUND_S)
+    this_tree = rack_commands(None)[0]
+    this_tree.run("run", rack, "--lockstep", *options, "--out", folder, bound_s=BOUND_S)
     recording = Recording(folder)
     ticks = int(recording.ended["outcome"]["ticks"])
     differing = list(differences(recording, _bare(rack, ticks)))

@@ -289,6 +289,7 @@ class RackRun(NamedTuple):
 
 
 def _run(rack: RackConfig, board: str, seconds: float, share: bool, awake: bool) -> RackRun:
+    """Run a rack once, and return the lateness of a board with its counts."""
     with (
         TemporaryDirectory(prefix="rack-bench-") as folder,
         cores_kept_awake() if awake else nullcontext(),

@@ -90,9 +90,14 @@ def _system(
         judge: Rule of the claim.
         rack: Rack that models the system. Empty if it has the name of the claim.
     """
-    why = "Both sides worked together until the task was done."
-    experiments = (tasks.TASKS[rack or name],)
-    return PaperClaim(name, title, quote, why, experiments, partial(judge, rates_hz))
+    return PaperClaim(
+        name,
+        title,
+        quote,
+        "Both sides worked together until the task was done.",
+        (tasks.TASKS[rack or name],),
+        partial(judge, rates_hz),
+    )
 
 
 SYSTEMS = (NAME, tasks.STATE_TABLES, *tasks.TASKS)

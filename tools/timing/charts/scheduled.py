@@ -90,11 +90,11 @@ class Schedule:
         counted_ns = SLICES * longest_ns
         until_ns = max(end_ns - skipped_ns, counted_ns + longest_ns)
         if (jobs := sum(until_ns // task.period_ns for task in self.tasks)) > MOST_CYCLES:
-            why = (
-                f"{SLICES} slices of the slowest task, {longest_ns * 1e-6:g} ms each, hold {jobs}"
-                " cycles of all"
+            raise Failure(
+                f"no schedule: {SLICES} slices of the slowest task, {longest_ns * 1e-6:g} ms each,"
+                f" hold {jobs} cycles of all tasks; at most {MOST_CYCLES} are simulated",
+                2,
             )
-            raise Failure(f"no schedule: {why}; at most {MOST_CYCLES} are simulated", 2)
         chart = simulate(self.tasks, until_ns, self.switch_ns, self._variants)
         lanes = lanes_of(self.tasks)
         detail = Detail(gap_ns=2 * self.switch_ns)

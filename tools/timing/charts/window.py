@@ -52,8 +52,11 @@ class WindowOptions:
         if start >= end:
             raise Failure(f"{_window(start, end)}: --to-ms must be later than --from-ms", 2)
         if end - start > (longest_ns := LONGEST * task.every_ns):
-            limit = f"a chart shows at most {LONGEST} cycles of '{task.board}', {ms(longest_ns)} ms"
-            raise Failure(f"{_window(start, end)}: {limit}", 2)
+            raise Failure(
+                f"{_window(start, end)}: a chart shows at most {LONGEST} cycles of '{task.board}',"
+                f" {ms(longest_ns)} ms",
+                2,
+            )
         return start, end
 
 

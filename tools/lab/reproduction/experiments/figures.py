@@ -160,6 +160,7 @@ class FigureRun(Charted):
 
 
 def _measure(figure: FigureRack, workshop: Workshop) -> FigureRun:
+    """Run a figure and draw the middle of the run."""
     run = _least_disturbed(figure, workshop)
     start_ns = run.middle_ns(next(task for task in run.tasks if task.name == PLANNER))
     executor = run.recording.trace(LEVEL)

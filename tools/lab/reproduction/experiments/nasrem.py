@@ -118,6 +118,7 @@ NASREM = Experiment(NAME, "nasrem in real time, its whole task", TASK_S, NasremR
 
 
 def _executor(cycles: Cycles, rack: RackTiming) -> ExecutorCycles:
+    """Summarise the cycles of an executor."""
     is_judged = cycles.is_judged
     rows = cycles.rows[is_judged]
     parts_ns = (cycles.exchange_ns, cycles.read_ns, cycles.write_ns)
@@ -176,6 +177,7 @@ def _recorded(workshop: Workshop, label: str, mode: str) -> Recorded:
 
 
 def _compared(run: Recorded, reference: Recording | None) -> ComparedRun:
+    """Return the digest of a run, and its first difference from a reference."""
     result, recording = run
     return ComparedRun(
         mode=recording.rack_config.clock.mode,
@@ -240,6 +242,7 @@ class GotoRuns:
 
 
 def _measure_goto(workshop: Workshop) -> GotoRuns:
+    """Run GOTO A in soft time, by a time that is too early, and by a possible time."""
     soft = _goto(workshop, "goto", None)
     if soft.done_s is None:
         raise Failure("goto without a time was not done")

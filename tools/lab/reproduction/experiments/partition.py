@@ -108,8 +108,8 @@ PARTITION = Experiment(
 
 
 def _figures(workshop: Workshop, partition: Partition, rack: RackConfig) -> PartitionFigures:
-    label = f"partition-{partition.coupling}-{partition.cores}"
-    run = workshop.run(label, rack, SECONDS).recording
+    """Run a rack in a partition, and return the counts of its tasks."""
+    run = workshop.run(f"partition-{partition.coupling}-{partition.cores}", rack, SECONDS).recording
     loads = core_loads(run, cycles_of(run), rack_timing(run.rack_config, run.layout))
     return PartitionFigures(partition, tuple(_task(task, run) for task in run.layout.tasks), loads)
 

@@ -64,6 +64,7 @@ def _measure_chains(workshop: Workshop) -> Chains:
 
 
 def _chain(label: str, workshop: Workshop, chain: Chain, protocol: str = "") -> ChainRun:
+    """Run a chain of boards, and count the cycles that its messages took."""
     run = _run(label, workshop, chain, protocol)
     missed, due = count_cycles(run.result.tasks[name] for name in chain.names)
     last = f"{chain.names[-1]}.status"

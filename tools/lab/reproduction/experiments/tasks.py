@@ -229,6 +229,7 @@ def _measure_two(later_ms: int, workshop: Workshop) -> NetworkRun:
 def _two_recorded(
     later_ms: int, workshop: Workshop, attempt: int
 ) -> tuple[RunResult, Recording, Recording]:
+    """Run both of Brown's racks, and return the result and both recordings."""
     label = f"task-{BROWN}-{later_ms}-{attempt}"
     path = workshop.folder / f"{label}-servo.toml"
     path.write_text(_servo(workshop, later_ms).text(), encoding="utf-8")
