@@ -159,13 +159,13 @@ def _network(config: RackConfig) -> Document | None:
     return {**{key: getattr(table, key) for key in keys}, "peers": table.racks, "entries": entries}
 
 
-def inventory_blocks(found: Document) -> Blocks:
+def inventory_blocks(data: Document) -> Blocks:
     """Yield an inventory as text for the terminal."""
-    boards = len({task["slot"] for task in found["tasks"]})
+    boards = len({task["slot"] for task in data["tasks"]})
     crate = f"{boards} board{'s' * (boards > 1)} and the clock"
-    yield f"rack {found['rack']}: {crate}, {found['clock_ms']:g} ms, {found['mode']}"
-    yield from found["notes"]
-    has_phases = any(task["phase_ticks"] for task in found["tasks"])
+    yield f"rack {data['rack']}: {crate}, {data['clock_ms']:g} ms, {data['mode']}"
+    yield from data["notes"]
+    has_phases = any(task["phase_ticks"] for task in data["tasks"])
     rows = [
         {
             "slot": task["slot"],
@@ -178,19 +178,19 @@ def inventory_blocks(found: Document) -> Blocks:
             "slice, ms": task["slice_ms"],
             "trace at": _hex(task["trace_address"]),
         }
-        for task in found["tasks"]
+        for task in data["tasks"]
     ]
     clock = {
         **dict.fromkeys(rows[0], ""),
         "slot": CLOCK_SLOT,
         "task": "clock",
-        "core": found["clock_core"],
-        "FIFO": found["clock_priority"] or None,
+        "core": data["clock_core"],
+        "FIFO": data["clock_priority"] or None,
     }
     yield ""
     yield TextTable([clock, *rows], ("trace at", "slice, ms"))
-    yield from _host_blocks(found["hosts"])
-    yield from _network_blocks(found["network"])
+    yield from _host_blocks(data["hosts"])
+    yield from _network_blocks(data["network"])
     yield ""
     mailboxes = [
         {
@@ -208,12 +208,12 @@ def inventory_blocks(found: Document) -> Blocks:
                 f"{mailbox['writer']} > {spanned(mailbox['readers']) or '(nobody)'}"
             ),
         }
-        for mailbox in found["mailboxes"]
+        for mailbox in data["mailboxes"]
     ]
     yield TextTable(mailboxes, ("slots", "bytes", "message", "protocol"))
     yield ""
-    windows = ", ".join(f"{board} {_hex(address)}" for board, address in found["windows"].items())
-    yield f"segment: {found['segment_bytes']} bytes; board windows: {windows}"
+    windows = ", ".join(f"{board} {_hex(address)}" for board, address in data["windows"].items())
+    yield f"segment: {data['segment_bytes']} bytes; board windows: {windows}"
 
 
 def _host_blocks(hosts: Sequence[Document]) -> Blocks:
@@ -253,10 +253,10 @@ def _network_blocks(network: Document | None) -> Blocks:
     yield TextTable(rows)
 
 
-def arm_lines(found: Document) -> Iterator[str]:
+def arm_lines(data: Document) -> Iterator[str]:
     """Yield the lines on the behaviour of an arm without torques and on its monitors."""
-    yield from (PATIENCE.format(**each) for each in found["patience"])
-    yield from (MONITORS.format(**each) for each in found["monitors"])
+    yield from (PATIENCE.format(**each) for each in data["patience"])
+    yield from (MONITORS.format(**each) for each in data["monitors"])
 
 
 def _hex(address: int) -> str:

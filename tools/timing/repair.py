@@ -275,7 +275,7 @@ def _any(
 ) -> Change | None:
     """Return the first change that works, trying all of them in order."""
     return next(
-        (change for one in tried if (change := _attempt(rack, board, one, cures)) is not None), None
+        (c for settings in tried if (c := _attempt(rack, board, settings, cures)) is not None), None
     )
 
 

@@ -110,9 +110,9 @@ def _margin(verdict: EquationVerdict) -> str:
     criterion = verdict.equation
     if criterion in EQUATIONS:
         criterion = f"eq. {criterion}".replace("eq. fig.", "fig.")
-    left = side_text(verdict.left, verdict.unit)
-    right = side_text(verdict.right, verdict.unit)
+    left_side = side_text(verdict.left, verdict.unit)
+    right_side = side_text(verdict.right, verdict.unit)
     unit = " ms" if verdict.unit == "ns" else ""
     fraction = verdict.margin / verdict.right
     remainder = f"{fraction:.0%} left" if fraction >= 0.0 else f"{-fraction:.0%} too much"
-    return f"{verdict.subject}, {criterion}: {left} of {right}{unit}, {remainder}"
+    return f"{verdict.subject}, {criterion}: {left_side} of {right_side}{unit}, {remainder}"

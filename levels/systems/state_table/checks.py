@@ -131,13 +131,13 @@ def _cases(state: str, rows: Mapping[int, RowConfig], vocabulary: Vocabulary) ->
     for number, row in rows.items():
         row_name = _named(number, row)
         box = {**all_cases, **{name: frozenset(values) for name, values in row.when.items()}}
-        for other, earlier_box in boxes.items():
+        for earlier_number, earlier_box in boxes.items():
             overlap = {name: values & earlier_box[name] for name, values in box.items()}
             if not row.otherwise and all(overlap.values()):
-                earlier = rows[other]
+                earlier = rows[earlier_number]
                 shared = {n: overlap[n] for n in conditions if n in row.when or n in earlier.when}
                 yield (
-                    f"{row_name}: overlaps {_named(other, earlier)} in '{state}' when"
+                    f"{row_name}: overlaps {_named(earlier_number, earlier)} in '{state}' when"
                     f" {_listed(shared)}; let them exclude each other, or give the later one else ="
                     " true"
                 )
@@ -184,8 +184,8 @@ def joined(boxes: Sequence[Box]) -> list[Box]:
     return merged
 
 
-def _differ_once(one: Box, other: Box) -> bool:
-    return sum(one[name] != other[name] for name in one) == 1
+def _differ_once(first: Box, second: Box) -> bool:
+    return sum(first[name] != second[name] for name in first) == 1
 
 
 def _described(box: Box, vocabulary: Vocabulary) -> str:

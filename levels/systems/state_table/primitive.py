@@ -50,7 +50,7 @@ If it stops in between while closing, it holds something.
 
 
 class JointMove(TableCommand, version=1):
-    """From the elemental move level of state tables to its primitive level."""
+    """Command from the elemental move level of state tables to its primitive level."""
 
     joints: np.ndarray = per_joint("rad", "where a motion ends")
     speed: float = field(unit="1", doc="part of the joints' limits")

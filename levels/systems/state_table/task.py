@@ -92,8 +92,8 @@ class TaskTable(StateTableExecutor):
         """Return a line for each step whose object is unknown."""
         known = ", ".join(scene.objects) or "none"
         return [
-            f"plan.step[{at}].object: unknown '{step.object}'; objects: {known}"
-            for at, step in enumerate(plan.step)
+            f"plan.step[{index}].object: unknown '{step.object}'; objects: {known}"
+            for index, step in enumerate(plan.step)
             if step.object not in scene.objects
         ]
 
@@ -116,11 +116,11 @@ class TaskTable(StateTableExecutor):
                 continue
             commands = MoveTable.wording(Operation.DO, other.params, context.scene)
             for name, path in tables.items():
-                for at, step in enumerate(cls.read(path, context.scene).plan.step):
+                for index, step in enumerate(cls.read(path, context.scene).plan.step):
                     if f"place {step.place}" not in commands:
                         why = (
-                            f"plan.step[{at}].place: unknown '{step.place}'; '{other.board}' knows:"
-                            f" {', '.join(commands)}"
+                            f"plan.step[{index}].place: unknown '{step.place}'; '{other.board}'"
+                            f" knows: {', '.join(commands)}"
                         )
                         yield f"params.tables.{name}", path.name, why
 

@@ -307,17 +307,18 @@ class ToolLeg:
         )
         return self._last
 
-    def _solve(self, pose: Pose, start: Array, part: float) -> Array:
+    def _solve(self, pose: Pose, start: Array, share: float) -> Array:
         """Return joint positions for a pose of the tool on the branch of `start`.
 
-        Raises `InfeasibleMotion` if there are none. Its text contains `part`, the progress along
-        the path, 0 to 1.
+        Raises `InfeasibleMotion` if there are none. Its text contains `share`, the completed
+        fraction of the path.
         """
         joints = self._ik.nearby(pose, start)
         if joints is None:
             x, y, z = pose.position
             raise Unfit(
-                f"no joint positions for the tool at {x:.3f} {y:.3f} {z:.3f}, {part:.0%} of the way"
+                f"no joint positions for the tool at {x:.3f} {y:.3f} {z:.3f},"
+                f" {share:.0%} of the way"
             )
         return joints
 

@@ -153,16 +153,16 @@ class SampledMotion:
         finally:
             self._look_ahead()
 
-    def _settle(self, state: JointSetPoint, part: float, least_s: float = 0.0) -> None:
+    def _settle(self, state: JointSetPoint, fraction: float, least_s: float = 0.0) -> None:
         """Let the present motion decay to rest.
 
         Args:
             state: Sample from which the ramp starts.
-            part: Fraction of the acceleration limits to use.
+            fraction: Fraction of the acceleration limits to use.
             least_s: Shortest time of the ramp, s.
         """
         least_s = max(least_s, LEAST_STOP_CYCLES * self._period_s)
-        self._settling = Settling(state, part * self._limits.acceleration, least_s)
+        self._settling = Settling(state, fraction * self._limits.acceleration, least_s)
         self._settles_s = self.time_s
         self._rest = self._settling.end
 
@@ -193,8 +193,8 @@ class SampledMotion:
             if not (np.abs(values) <= EXCESS * limits).all():
                 joint = int((np.abs(values) / limits).argmax())
                 name = self._joints[joint]
-                most = limits[joint]
+                limit = limits[joint]
                 raise Unfit(
                     f"joint '{name}' would need {abs(values[joint]):.2f} {unit}; permitted:"
-                    f" {most:.2f}"
+                    f" {limit:.2f}"
                 )

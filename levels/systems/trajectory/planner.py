@@ -371,8 +371,8 @@ class RequestPlanner(Planner):
         joints = self._ik.reach(target, previous)
         if joints is not None:
             return joints
-        others = self._ik.reachable(target, previous)
-        return others[0] if others else previous
+        solutions = self._ik.reachable(target, previous)
+        return solutions[0] if solutions else previous
 
     def _tool(self, step: Step) -> Pose | None:
         """Return the pose of the tool at the goal of a step, in the step's frame.

@@ -105,8 +105,8 @@ class Agenda:
     @property
     def next(self) -> MotionRequest | None:
         """Request to begin next. None if there is none."""
-        at = int(self.begun)
-        return self.held[at] if len(self.held) > at else None
+        index = int(self.begun)
+        return self.held[index] if len(self.held) > index else None
 
     @property
     def done(self) -> int:

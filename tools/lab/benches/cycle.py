@@ -164,15 +164,15 @@ def _run(
 
 
 def costs(
-    cycles: Mapping[tuple[str, str], list[Cycles]], physics_us: list[float], other: str | None
+    cycles: Mapping[tuple[str, str], list[Cycles]], physics_us: list[float], baseline: str | None
 ) -> CycleCosts:
     """Compute the costs of all measured cycles.
 
     Args:
         cycles: Cycles of all runs, by case and contestant.
         physics_us: Processor time of ticks of bare physics, us.
-        other: Name of the checkout that serves as baseline. None to compare the servo level's cycle
-            with its physics.
+        baseline: Name of the checkout with which this one is compared. None to compare the servo
+            level's cycle with its physics.
     """
     cases = list(dict.fromkeys(case for case, _ in cycles))
     samples = []
@@ -188,7 +188,7 @@ def costs(
             parts[key] = {part: float(np.median(times_us)) for part, times_us in medians.items()}
     if physics_us:
         samples.append(Sample(COMPARED, PHYSICS, tuple(physics_us), "us"))
-    baselines = {COMPARED: PHYSICS} if other is None else dict.fromkeys(cases, other)
+    baselines = {COMPARED: PHYSICS} if baseline is None else dict.fromkeys(cases, baseline)
     return CycleCosts(
         "cycle", "Processor time of a board's cycle", tuple(samples), baselines, parts=parts
     )

@@ -319,11 +319,11 @@ def compare_idle_cores(samples: Sequence[Sample], who: str) -> str:
     """
     results = []
     for setting, name in (("sleep", who), ("awake", who + AWAKE)):
-        own = [sample for sample in samples if sample.who == name]
-        if not own:
+        runs = [sample for sample in samples if sample.who == name]
+        if not runs:
             return ""
-        lost = sum(us >= 1e6 / float(each.case.split()[0]) for each in own for us in each.values)
-        worst_us = max(each.worst for each in own)
+        lost = sum(us >= 1e6 / float(each.case.split()[0]) for each in runs for us in each.values)
+        worst_us = max(each.worst for each in runs)
         figures = f'"{setting}", {lost} wake-ups late by a period, worst {shown(worst_us)} us'
         results.append((lost, worst_us, figures))
     total = sum(lost for lost, _, _ in results)

@@ -198,16 +198,16 @@ def _reading(segment: Segment, box: MailboxSpec, task: str) -> Callable[[int], A
     if can_read(line):
         read_table = ReadTable([line]).read
 
-        def take_from_table(tick: int) -> AnyMessage:
+        def read_by_table(tick: int) -> AnyMessage:
             read_table(tick + delay)
             return message
 
-        return take_from_table
+        return read_by_table
 
-    def take(tick: int) -> AnyMessage:
+    def read_message(tick: int) -> AnyMessage:
         return read(tick + delay).message
 
-    return take
+    return read_message
 
 
 def _layout(rack: str, protocol: Protocol, case: Case) -> Layout:

@@ -146,11 +146,11 @@ def _into(dtype: np.dtype, fetch: Callable[[memoryview], object]) -> Callable[[i
     message = AnyMessage(dtype)
     raw = message.raw
 
-    def take(tick: int) -> AnyMessage:
+    def read_message(tick: int) -> AnyMessage:
         fetch(raw)
         return message
 
-    return take
+    return read_message
 
 
 @contextmanager

@@ -99,12 +99,12 @@ def reproduce(
 def _write(workshop: Workshop, results: dict[str, Kept | str]) -> Page:
     """Write the page into the folder in every form, and return it."""
     facts = {name: str(value) for name, value in (machine() | {"program": program()}).items()}
-    for name, one in results.items():
-        if isinstance(one, Kept):
-            facts[name] = f"{one.made_at}, {one.took_s:g} s {one.lacking}"
+    for name, result in results.items():
+        if isinstance(result, Kept):
+            facts[name] = f"{result.made_at}, {result.took_s:g} s {result.lacking}"
     sections = tuple(
-        Section(one.section, one.title, tuple(claim.judge_by(results) for claim in one.claims))
-        for one in SECTIONS
+        Section(each.section, each.title, tuple(claim.judge_by(results) for claim in each.claims))
+        for each in SECTIONS
     )
     rulings = [claim.ruling for section in sections for claim in section.claims]
     page = Page(facts, {ruling: rulings.count(ruling) for ruling in LABELS}, sections)

@@ -91,9 +91,9 @@ def judge_determinism(runs: Sequence[ComparedRun]) -> ClaimVerdict:
     )
 
 
-def judge_speedup(one: FigureRun, two: FigureRun) -> ClaimVerdict:
+def judge_speedup(on_one: FigureRun, on_two: FigureRun) -> ClaimVerdict:
     """Compare the number of plans of a level on one processor and on two."""
-    plans_on_one, plans_on_two = (run.tasks[PLANNER].jobs for run in (one, two))
+    plans_on_one, plans_on_two = (run.tasks[PLANNER].jobs for run in (on_one, on_two))
     needs = [compare("plans_on_one_processor", plans_on_one, ">=", 1)]
     return rule_on(compare("plans_on_two_processors", plans_on_two, ">", plans_on_one), needs=needs)
 
@@ -139,8 +139,8 @@ def judge_communication(run: NasremRun, partitions: Sequence[PartitionFigures]) 
     """
     communication = sum(task.communication_us / task.slice_ms for task in run.executors.values())
     loads = {each.partition: each.loads.values() for each in partitions}
-    one, two = (loads[Partition("tight", cores)] for cores in (1, 2))
-    saved_ms = 1e3 * (sum(one) - max(two))
+    one_core, two_cores = (loads[Partition("tight", cores)] for cores in (1, 2))
+    saved_ms = 1e3 * (sum(one_core) - max(two_cores))
     return rule_on(compare("communication_ms_per_s", communication, "<", saved_ms))
 
 
@@ -198,10 +198,10 @@ def judge_equation(number: str, run: NasremRun) -> ClaimVerdict:
 
     Within bounds it holds in 99 of 100 cycles.
     """
-    verdicts = [one for one in run.verdicts if one.measured.equation == number]
+    verdicts = [each for each in run.verdicts if each.measured.equation == number]
     return rule_on(
-        ideal=check_equations(one.measured for one in verdicts),
-        here=check_none(failing_in_1_of_100_cycles=sum(not one.mostly for one in verdicts)),
+        ideal=check_equations(each.measured for each in verdicts),
+        here=check_none(failing_in_1_of_100_cycles=sum(not each.mostly for each in verdicts)),
         needs=[compare("subjects", len(verdicts), ">=", 1)],
     )
 
@@ -288,15 +288,15 @@ def judge_working(run: FigureRun) -> ClaimVerdict:
     return rule_on(ideal=late, here=[_compare_late(run, "<=")], needs=_undisturbed(run))
 
 
-def judge_failing(found: FigureRun, *shorter: FigureRun) -> ClaimVerdict:
+def judge_failing(paper_run: FigureRun, *shorter: FigureRun) -> ClaimVerdict:
     """Judge a figure that fails according to the paper.
 
     Args:
-        found: Run of the figure.
+        paper_run: Run of the figure.
         shorter: Runs with the shortest X that the paper permits. They should fail as well.
     """
     shortest = [_compare_late(run, ">", "shortest_X_late_share") for run in shorter]
-    return rule_on(_compare_late(found, ">"), ideal=shortest, needs=_undisturbed(found))
+    return rule_on(_compare_late(paper_run, ">"), ideal=shortest, needs=_undisturbed(paper_run))
 
 
 def check_planning(process_ms: float) -> tuple[Check, Check]:
@@ -385,29 +385,29 @@ def judge_figure_5(partitions: Sequence[PartitionFigures]) -> ClaimVerdict:
     ]
 
     def missed_share(group: str) -> float:
-        own = [task for name, task in tasks if name == group]
-        bad = sum(task.missed + task.skipped for task in own)
-        return bad / max(sum(task.cycles for task in own), 1)
+        group_tasks = [task for name, task in tasks if name == group]
+        bad = sum(task.missed + task.skipped for task in group_tasks)
+        return bad / max(sum(task.cycles for task in group_tasks), 1)
 
-    most = missed_share("loose") + FEW
+    max_missed = missed_share("loose") + FEW
     plans = min((task.cycles for _, task in tasks if task.role == "planner"), default=0)
     return rule_on(
         compare("slow_levels_missed_share", missed_share("slow"), "<=", FEW),
-        ideal=[compare("fast_levels_missed_share", missed_share("tight"), ">", most)],
+        ideal=[compare("fast_levels_missed_share", missed_share("tight"), ">", max_missed)],
         needs=[compare("fewest_plans", plans, ">=", 1)],
     )
 
 
-def judge_systems(names: Iterable[str], *found: TaskRun | TableRuns) -> ClaimVerdict:
+def judge_systems(names: Iterable[str], *records: TaskRun | TableRuns) -> ClaimVerdict:
     """Compare the responses in whole tasks of some systems with their bounds, ms.
 
     Within bounds they may be prolonged by missed cycles.
 
     Args:
         names: Names of the systems.
-        found: A run, or runs, of each system.
+        records: Record of each system's whole task.
     """
-    runs = [run.disturbed if isinstance(run, TableRuns) else run for run in found]
+    runs = [run.disturbed if isinstance(run, TableRuns) else run for run in records]
     ways = {
         f"{name}_{way}_ms": response
         for name, run in zip(names, runs, strict=True)
@@ -435,35 +435,35 @@ def judge_layers(names: Iterable[str]) -> ClaimVerdict:
 
 
 def judge_links(
-    rates_hz: Mapping[str, int], found: TaskRun, ideal: Sequence[Check] = ()
+    rates_hz: Mapping[str, int], run: TaskRun, ideal: Sequence[Check] = ()
 ) -> ClaimVerdict:
     """Compare the messages between the sides of a system with the number that its rates demand.
 
     Args:
         rates_hz: Rate of each mailbox, Hz. 1 demands at least one message.
-        found: Whole task of the system.
+        run: Whole task of the system.
         ideal: Further comparisons for the claim to hold. Without them it holds within bounds.
     """
     min_counts = {
-        box: (1.0 - STRAY) * rate_hz * found.lasted_s if rate_hz > 1 else 1
+        box: (1.0 - STRAY) * rate_hz * run.lasted_s if rate_hz > 1 else 1
         for box, rate_hz in rates_hz.items()
     }
     return rule_on(
-        *check_done(found),
-        compare("missed_share", found.missed, "<=", STRAY),
+        *check_done(run),
+        compare("missed_share", run.missed, "<=", STRAY),
         *(
-            compare(f"{box}_messages", found.messages.get(box, 0), ">=", count)
+            compare(f"{box}_messages", run.messages.get(box, 0), ">=", count)
             for box, count in min_counts.items()
         ),
         ideal=ideal,
     )
 
 
-def judge_rccl(rates_hz: Mapping[str, int], found: TaskRun) -> ClaimVerdict:
+def judge_rccl(rates_hz: Mapping[str, int], run: TaskRun) -> ClaimVerdict:
     """Judge RCCL's links. For the claim to hold, every joint also needs a processor."""
     joints = [task.core for task in wire(load("rccl")).tasks if task.board.startswith("joint")]
     cores = compare("processors_of_joints", len(set(joints)), ">=", len(joints))
-    return judge_links(rates_hz, found, [cores])
+    return judge_links(rates_hz, run, [cores])
 
 
 def judge_predictable(run: ResponseRun) -> ClaimVerdict:

@@ -67,10 +67,10 @@ def column_for(window_ns: int, shortest_ns: int | None) -> int:
     """
     steps: list[int] = [digit * 10**power for power in range(3, 12) for digit in (1, 2, 5)]
     fits = next((step for step in steps if window_ns <= COLUMNS * step), steps[-1])
-    seen = max(
+    fine = max(
         (step for step in steps if shortest_ns is not None and step <= shortest_ns), default=fits
     )
-    return max(fits, seen)
+    return max(fits, fine)
 
 
 def _row(chart: Chart, lane: Lane, column_ns: int) -> str:

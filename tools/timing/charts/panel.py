@@ -144,12 +144,12 @@ def _in_ms(entry: Span | Job | Lane, *names: str) -> dict[str, float | None]:
 def without(stretch: Stretch, busy: Sequence[Stretch]) -> Iterator[Stretch]:
     """Yield the parts of a stretch that are not in `busy`, which is sorted and without overlaps."""
     start, end = stretch
-    for at in range(bisect_right(busy, start, key=lambda taken: taken[1]), len(busy)):
-        if busy[at][0] >= end:
+    for index in range(bisect_right(busy, start, key=lambda entry: entry[1]), len(busy)):
+        if busy[index][0] >= end:
             break
-        if busy[at][0] > start:
-            yield start, busy[at][0]
-        start = busy[at][1]
+        if busy[index][0] > start:
+            yield start, busy[index][0]
+        start = busy[index][1]
     if start < end:
         yield start, end
 

@@ -185,12 +185,12 @@ def _beginnings(chart: Chart, lane: Lane, within: Stretch) -> Iterator[tuple[int
     """Yield the plans and the cycles without a plan, each as start, number of cycles, is_plan."""
     slices = lane.slice_ns // lane.cycle_ns
     plans = {job.release_ns for job in chart.jobs if lane.planner and job.task == lane.planner}
-    planned = {plan + at * lane.cycle_ns for plan in plans for at in range(slices)}
-    for at in range(lane.cycle_from(within[0]), within[1], lane.cycle_ns):
-        if at in plans:
-            yield at, slices, True
-        elif at not in planned and lane.executor is not None:
-            yield at, 1, False
+    planned = {plan + start_ns * lane.cycle_ns for plan in plans for start_ns in range(slices)}
+    for start_ns in range(lane.cycle_from(within[0]), within[1], lane.cycle_ns):
+        if start_ns in plans:
+            yield start_ns, slices, True
+        elif start_ns not in planned and lane.executor is not None:
+            yield start_ns, 1, False
 
 
 def _order(spans: Sequence[Span], lane: Lane, within: Stretch, detail: Detail) -> str:

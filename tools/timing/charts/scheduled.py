@@ -124,12 +124,12 @@ class Schedule:
 def _later(chart: Chart, by_ns: int) -> Chart:
     """Return a chart with all times increased by `by_ns`."""
 
-    def moved(entry: E) -> E:
+    def shift(entry: E) -> E:
         """Return a chart, span or job with all its times later."""
         times = {name: time for name, time in vars(entry).items() if name.endswith("_ns")}
         shifted = {name: time + by_ns for name, time in times.items() if time is not None}
         return replace(entry, **shifted)
 
     return replace(
-        moved(chart), spans=tuple(map(moved, chart.spans)), jobs=tuple(map(moved, chart.jobs))
+        shift(chart), spans=tuple(map(shift, chart.spans)), jobs=tuple(map(shift, chart.jobs))
     )

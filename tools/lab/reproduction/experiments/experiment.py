@@ -161,9 +161,9 @@ class Experiment(Generic[Found]):
         """Convert plain data to a record."""
         return TypeAdapter(self.kind).validate_python(data)
 
-    def document(self, found: Found) -> Any:
+    def document(self, record: Found) -> Any:
         """Convert a record to plain data."""
-        return TypeAdapter(self.kind).dump_python(found, mode="json")
+        return TypeAdapter(self.kind).dump_python(record, mode="json")
 
 
 def depends() -> Document:

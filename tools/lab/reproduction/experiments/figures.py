@@ -108,16 +108,16 @@ def _with_x(name: str, cycles: int, process_ms: float) -> FigureRack:
     return FigureRack(name, cycles, label, settings_of(name, process_ms))
 
 
-def _storing(task: str, part: str) -> FigureRack:
+def _storing(task: str, key: str) -> FigureRack:
     """Build a variant of figure 2 in which a task stores data.
 
     Args:
         task: "planner" or "executor".
-        part: Key of the budget to which storing belongs.
+        key: Key of the budget that contains the time for storing.
     """
     settings = (
         f'board.{LEVEL}.{task}="{storing.__name__}:Storing{task.capitalize()}"',
-        f"board.{LEVEL}.budget.{part}={STORING_MS}",
+        f"board.{LEVEL}.budget.{key}={STORING_MS}",
         # The kernel reserves 5 % of each second for ordinary scheduling. A planner that always has
         # work would exhaust the rest, and the kernel would stop the executor as well.
         f"board.{LEVEL}.planner_priority=0",

@@ -96,12 +96,12 @@ def response_from(report: Mapping[str, Any] | None) -> SystemResponse | None:
     return SystemResponse(report["sum_eq_3_3_ms"], ways)
 
 
-def _way_response(way: Mapping[str, Any]) -> WayResponse:
-    delays = [beyond["delayed_by"] for beyond in way["beyond"]]
-    times = way["measured_ms"]
+def _way_response(direction: Mapping[str, Any]) -> WayResponse:
+    delays = [beyond["delayed_by"] for beyond in direction["beyond"]]
+    times = direction["measured_ms"]
     return WayResponse(
         longest_ms=None if times is None else times["max"],
-        bound_ms=way["bound_ms"],
+        bound_ms=direction["bound_ms"],
         unexplained=sum(not any("missed" in delay for delay in each) for each in delays),
     )
 
@@ -237,11 +237,11 @@ def _two_recorded(
     with chdir(workshop.folder):
         # The rack that is launched by this one records its run below the working folder.
         result, general = workshop.run(label, _renamed(workshop, BROWN, lan_settings))
-    (other,) = result.others
-    assert other.folder is not None, "it is recorded, as the other is"
+    (launched,) = result.others
+    assert launched.folder is not None, "it is recorded, as the other is"
     folder = workshop.folder / RUNS / f"{label}-servo"
     shutil.rmtree(folder, ignore_errors=True)
-    return result, general, Recording((workshop.folder / other.folder).rename(folder))
+    return result, general, Recording((workshop.folder / launched.folder).rename(folder))
 
 
 def _servo(workshop: Workshop, later_ms: int) -> RackConfig:
