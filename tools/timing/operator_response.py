@@ -172,8 +172,8 @@ class OperatorResponse:
     def blocks(self) -> Blocks:
         """Yield the figures as text for the terminal."""
         yield (
-            f"response to {len(self.measured)} operator commands, ms of simulated time: from giving"
-            " a command, and"
+            f"response to {len(self.measured)} operator commands, ms of simulated time:"
+            " from giving a command, and"
         )
         yield "from the release that reads it, to the end of the cycle whose torque rests on it"
         rows = [

@@ -100,7 +100,7 @@ def tightest(verdicts: Sequence[EquationVerdict]) -> Iterator[str]:
         if verdict.sign != "=" and verdict.equation not in RESPONSES and verdict.right > 0.0
     ]
     if bounds:
-        yield f"tightest: {_margin(min(bounds, key=lambda bound: bound.margin / bound.right))}"
+        yield f"tightest: {_margin(min(bounds, key=lambda each: each.margin / each.right))}"
 
 
 def _margin(verdict: EquationVerdict) -> str:

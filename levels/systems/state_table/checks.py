@@ -68,7 +68,7 @@ def _words(row: RowConfig, vocabulary: Vocabulary, lexicon: Lexicon | None) -> I
     if row.status in REASONED and not row.reason and "status" in row.model_fields_set:
         yield f"reason: missing; status {row.status} needs one, a line for the user"
     if row.status not in REASONED and row.reason:
-        yield f"reason: status {row.status} shows none; statuses that do: {', '.join(REASONED)}"
+        yield (f"reason: status {row.status} shows none; statuses that do: {', '.join(REASONED)}")
 
 
 def _conditions(row: RowConfig, vocabulary: Vocabulary) -> list[str]:
@@ -98,7 +98,9 @@ def _states(table: StateTable) -> Iterator[str]:
         yield f"start: no row has the state '{table.start}'; states: {known}"
     for number, row in table.configs.items():
         if row.next not in (*names, SAME):
-            yield f"{_named(number, row)}: next: no row has the state '{row.next}'; states: {known}"
+            yield (
+                f"{_named(number, row)}: next: no row has the state '{row.next}'; states: {known}"
+            )
     if table.start not in names:
         return
     reached = [table.start]
@@ -137,9 +139,9 @@ def _cases(state: str, rows: Mapping[int, RowConfig], vocabulary: Vocabulary) ->
                 earlier = rows[earlier_number]
                 shared = {n: overlap[n] for n in conditions if n in row.when or n in earlier.when}
                 yield (
-                    f"{row_name}: overlaps {_named(earlier_number, earlier)} in '{state}' when"
-                    f" {_listed(shared)}; let them exclude each other, or give the later one else ="
-                    " true"
+                    f"{row_name}: overlaps {_named(earlier_number, earlier)} in '{state}'"
+                    f" when {_listed(shared)}; let them exclude each other, or give the later one"
+                    " else = true"
                 )
         rest = [piece for box_left in uncovered for piece in without(box_left, box)]
         if row.otherwise and rest == uncovered:

@@ -160,8 +160,7 @@ class Motions:
 
     def done(self, request: int | None = None) -> bool:
         """Return True if a request, by default the newest, has ended."""
-        number = self._newest if request is None else request
-        return bool(self._status.done >= number)
+        return bool(self._status.done >= (self._newest if request is None else request))
 
     def wait(self, request: int | None = None, until: Callable[[], bool] = lambda: False) -> bool:
         """Wait until a request, by default the newest, has ended.

@@ -126,7 +126,6 @@ class SampledMotion:
         self._stop_from(self.state)
 
     def _stop_from(self, state: JointSetPoint) -> None:
-        """Ramp to rest from a state, and drop the leg."""
         self._settle(state, STOP_PART)
         self.leg = None
         self._look_ahead()

@@ -89,6 +89,7 @@ def checkout(tree: Path) -> RackCommand:
     # A copied environment still runs the tree from which it was copied.
     if (actual := Path(locate.run(bound_s=WHERE_S).strip())) != tree.resolve():
         raise Failure(
-            f"{tree}: its .venv belongs to {actual}; to renew it: make -C {tree} clean {ENV}", 2
+            f"{tree}: its .venv belongs to {actual}; to renew it: make -C {tree} clean {ENV}",
+            2,
         )
     return replace(locate, argv=(str(python), "-c", RUN))

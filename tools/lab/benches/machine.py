@@ -164,7 +164,7 @@ class Machine(Comparison):
         for rate in self.rates:
             late = "" if rate.late is None else f", {CYCLICTEST} late in {rate.late:.2%}"
             counts = f"missed {rate.missed:.2%} of {rate.cycles} cycles{late}"
-            yield f"{rate.rate_hz:g} Hz {rate.verdict}; {counts}; {self._worst(rate.rate_hz)}"
+            yield (f"{rate.rate_hz:g} Hz {rate.verdict}; {counts}; {self._worst(rate.rate_hz)}")
 
     def _worst(self, rate_hz: float) -> str:
         """Format the worst lateness of the board and of `cyclictest` at a rate."""

@@ -111,8 +111,13 @@ def compare(samples: Sequence[Sample], absent: tuple[Absent, ...]) -> Comparison
         peer_samples = [sample for sample in samples if sample.case == case and sample.who in peers]
         if peer_samples:
             baselines[case] = min(peer_samples, key=lambda sample: sample.median).who
-    title = "A message written and read; ratio to the best peer of the case"
-    return Comparison("mailbox", title, tuple(samples), baselines, absent)
+    return Comparison(
+        "mailbox",
+        "A message written and read; ratio to the best peer of the case",
+        tuple(samples),
+        baselines,
+        absent,
+    )
 
 
 def _measure_case(case: Case, peers: Sequence[Peer], rounds: int) -> list[Sample]:

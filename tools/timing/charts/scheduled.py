@@ -91,8 +91,9 @@ class Schedule:
         until_ns = max(end_ns - skipped_ns, counted_ns + longest_ns)
         if (jobs := sum(until_ns // task.period_ns for task in self.tasks)) > MOST_CYCLES:
             raise Failure(
-                f"no schedule: {SLICES} slices of the slowest task, {longest_ns * 1e-6:g} ms each,"
-                f" hold {jobs} cycles of all tasks; at most {MOST_CYCLES} are simulated",
+                f"no schedule: {SLICES} slices of the slowest task,"
+                f" {longest_ns * 1e-6:g} ms each, hold {jobs} cycles of all tasks;"
+                f" at most {MOST_CYCLES} are simulated",
                 2,
             )
         chart = simulate(self.tasks, until_ns, self.switch_ns, self._variants)

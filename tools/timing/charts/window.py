@@ -53,8 +53,8 @@ class WindowOptions:
             raise Failure(f"{_window(start, end)}: --to-ms must be later than --from-ms", 2)
         if end - start > (longest_ns := LONGEST * task.every_ns):
             raise Failure(
-                f"{_window(start, end)}: a chart shows at most {LONGEST} cycles of '{task.board}',"
-                f" {ms(longest_ns)} ms",
+                f"{_window(start, end)}: a chart shows at most {LONGEST} cycles of"
+                f" '{task.board}', {ms(longest_ns)} ms",
                 2,
             )
         return start, end

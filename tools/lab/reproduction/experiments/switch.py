@@ -55,8 +55,7 @@ class SwitchRun:
 
 
 def _measure(workshop: Workshop) -> SwitchRun:
-    assumed_us = 1e3 * workshop.config(NAME).timing.context_switch_ms
-    return SwitchRun(measure_switch(), assumed_us)
+    return SwitchRun(measure_switch(), 1e3 * workshop.config(NAME).timing.context_switch_ms)
 
 
 SWITCH = Experiment(

@@ -304,8 +304,8 @@ def _first_ns(recording: Recording, box: str, field: str) -> int | None:
 
 def _two_racks(later_ms: int, about: str) -> Experiment[NetworkRun]:
     name = f"task-{BROWN}-later" if later_ms else f"task-{BROWN}"
-    expected_s = BROWN_S + 2 * LAUNCH_S
-    return Experiment(name, about, expected_s, NetworkRun, partial(_measure_two, later_ms))
+    measure = partial(_measure_two, later_ms)
+    return Experiment(name, about, BROWN_S + 2 * LAUNCH_S, NetworkRun, measure)
 
 
 NETWORK = _two_racks(0, "the whole task of brown's two racks in real time")
