@@ -66,10 +66,7 @@ class JointBoards:
         return True
 
     def leave(self, reason: str) -> None:
-        """Fall out of step.
-
-        The boards bring the joints to rest, from where motion restarts later.
-        """
+        """Fall out of step. The boards bring the joints to rest, where motion restarts later."""
         self.in_step = False
         self.awaited = reason
 

@@ -225,7 +225,7 @@ class TrajectoryExecutor(Executor):
 
 
 LASTS_S = 0.04
-"""Length of the two medians that are compared, at the begin and end of the window, s.
+"""Length of the two medians that are compared, at the start and end of the window, s.
 
 Effects of a late cycle or a short braking decay within half of it. The window is five times as
 long. In a longer window, slow motion alone would change the torques.
@@ -235,7 +235,7 @@ long. In a longer window, slow motion alone would change the torques.
 class TouchGuard:
     """Detects contact of the arm by a lasting change of a joint's torque.
 
-    It compares the torques, N m, at the end of its window with those at the begin, one sample per
+    It compares the torques, N m, at the end of its window with those at the start, one sample per
     cycle. Torques also change when the arm brakes, holds, or continues after missed cycles. Such a
     change is not a contact, and therefore clears the window.
     """

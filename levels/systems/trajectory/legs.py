@@ -192,11 +192,11 @@ class Times(NamedTuple):
 
 
 class TimeLaw:
-    """Progress along a leg, 0 to 1, as a function of the time since its begin.
+    """Progress along a leg, 0 to 1, as a function of the time since its start.
 
     Attributes:
         segment_s: Time of the segment, s.
-        half_blend_s: Half the time in which the speed rises at the begin, s.
+        half_blend_s: Half the time in which the speed rises at the start, s.
         min_end_blend_half_s: Shortest permitted value of `end_blend_half_s`, s.
         end_blend_half_s: Half the time in which the speed falls at the end, s. It is positive, and
             at most `half_blend_s`.
@@ -238,7 +238,7 @@ class TimeLaw:
 
 
 def _ramp(time_s: float, half_s: float) -> float:
-    """Return the distance covered `time_s` after the begin of a smooth rise of speed.
+    """Return the distance covered `time_s` after the start of a smooth rise of speed.
 
     The speed rises from 0 to 1 during twice `half_s`.
     """
@@ -257,7 +257,7 @@ class JointLeg:
         self.law = timed(times, np.abs(self._way), np.zeros(len(goal)), limits)
 
     def at(self, time_s: float) -> Array:
-        """Return the joint positions `time_s` after the begin, (joints,), rad."""
+        """Return the joint positions `time_s` after the start, (joints,), rad."""
         return np.asarray(self._start + self.law.part(time_s) * self._way)
 
 
@@ -278,7 +278,7 @@ class ToolLeg:
         """Solve the path at some poses and choose its time law.
 
         Args:
-            start: Joint positions at the begin, (joints,), rad.
+            start: Joint positions at the start, (joints,), rad.
             goal: Goal of the tool.
             times: Times that the request asks for.
             ik: Inverse kinematics of the arm.
@@ -296,7 +296,7 @@ class ToolLeg:
         self.law = timed(times, speed, bend, limits)
 
     def at(self, time_s: float) -> Array:
-        """Return the joint positions `time_s` after the begin, (joints,), rad.
+        """Return the joint positions `time_s` after the start, (joints,), rad.
 
         Raises:
             InfeasibleMotion: If the pose has no joint positions.
@@ -383,12 +383,12 @@ class Settling:
         """Compute the ramp of each joint.
 
         Args:
-            state: Positions, velocities and accelerations at the begin, rad, rad/s, rad/s2.
+            state: Positions, velocities and accelerations at the start, rad, rad/s, rad/s2.
             max_acceleration: Acceleration limits of the joints, (joints,), rad/s2.
             min_duration_s: Shortest time of a ramp, s.
         """
         self._position, self._velocity, acceleration = state
-        # The peak acceleration is at most 1.5 |v| / T + |a| / 3 later, and |a| at the begin.
+        # The peak acceleration is at most 1.5 |v| / T + |a| / 3 later, and |a| at the start.
         self._acceleration = np.clip(acceleration, -max_acceleration, max_acceleration)
         spare_acceleration = max_acceleration - np.abs(self._acceleration) / 3.0
         self._time_s = np.maximum(1.5 * np.abs(self._velocity) / spare_acceleration, min_duration_s)
@@ -396,7 +396,7 @@ class Settling:
         self.end = self.at(self.ends_s)
 
     def at(self, time_s: float) -> Array:
-        """Return the joint positions `time_s` after the begin, (joints,), rad."""
+        """Return the joint positions `time_s` after the start, (joints,), rad."""
         t = self._time_s
         h = np.minimum(time_s / t, 1.0)
         by_velocity = h - h * h * h * (1.0 - 0.5 * h)

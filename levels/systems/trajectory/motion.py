@@ -166,7 +166,7 @@ class SampledMotion:
         self._rest = self._settling.end
 
     def _look_ahead(self) -> None:
-        """Evaluate the next sample again after the motion has changed."""
+        """Evaluate the next sample, again if the motion has changed."""
         before, present, _ = self._samples
         self._samples = before, present, self._evaluate(self.time_s + self._period_s)
 

@@ -256,7 +256,7 @@ def judge_waits(waits: Waits) -> ClaimVerdict:
 
 
 def judge_update(run: FigureRun) -> ClaimVerdict:
-    """Count the updates of a plan that were preempted. Only updates during a release can be."""
+    """Count the plan updates that were preempted, of those in which the executor was released."""
     return rule_strays("updates_preempted", run.preempted, run.met)
 
 

@@ -130,9 +130,9 @@ class TracedRun:
 
     @cached_property
     def _records(self) -> dict[str, tuple[np.ndarray, int]]:
-        """Records and longest response, ns, of every task.
+        """Trace records and longest response of every task, ns.
 
-        Those of a planner contain only plans.
+        A planner has only those of plans.
         """
         records = {}
         for task in self.tasks:

@@ -182,7 +182,10 @@ def patterns(chart: Chart, lane: Lane, within: Stretch, detail: Detail) -> Patte
 
 
 def _beginnings(chart: Chart, lane: Lane, within: Stretch) -> Iterator[tuple[int, int, bool]]:
-    """Yield the plans and the cycles without a plan, each as start, number of cycles, is_plan."""
+    """Yield the plans, and the cycles without a plan, that begin within a stretch.
+
+    Each is a tuple of its start, ns, its number of cycles, and whether it is a plan.
+    """
     slices = lane.slice_ns // lane.cycle_ns
     plans = {job.release_ns for job in chart.jobs if lane.planner and job.task == lane.planner}
     planned = {plan + start_ns * lane.cycle_ns for plan in plans for start_ns in range(slices)}
