@@ -1,3 +1,5 @@
-"""What only racks other than NASREM's have: other historical systems, force, hands, work shared by
-racks.
+"""Levels that only racks other than NASREM's use.
+
+They belong to the other historical systems: state tables, trajectories, force control, hands, and
+work shared by several racks.
 """

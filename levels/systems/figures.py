@@ -1,5 +1,6 @@
-"""The level of the paper's Gantt charts (section 3.4, figures 2 to 4): it only consumes processor
-time.
+"""The level of the paper's Gantt charts, which only consumes processor time.
+
+See section 3.4, figures 2 to 4.
 """
 
 from __future__ import annotations
@@ -38,26 +39,27 @@ Milliseconds = Annotated[float, Parameter(ge=0, le=10_000, allow_inf_nan=False)]
 
 
 class FigureParams(Table):
-    """Processor times of the level's unit functions; R, W, U and C are the bus's, in
-    `[board.<name>.transfer]`.
+    """Processor times of the level's unit functions, in `[board.<name>.params]`.
+
+    The times R, W, U and C belong to the bus and are set in `[board.<name>.transfer]`.
     """
 
     process_ms: Milliseconds | Annotated[tuple[Milliseconds, ...], Parameter(min_length=1)] = 2.0
-    """X: the executor in a cycle, ms; several times are taken in turn, cycle by cycle"""
+    """X: time of the executor in a cycle, ms; a list is repeated, one entry per cycle"""
     plan_ms: Milliseconds = 6.0
     """P: one plan, without its update, ms"""
 
 
 class FigureLoop(Executor):
-    """Computes for X of processor time in every cycle: a level without a planner."""
+    """Level without a planner that consumes the processor time X in every cycle."""
 
     status = Output(FigureStatus)
     params = FigureParams
     plan_in_use = -1
-    """Release that the plan in force answers; -1: there is none."""
+    """Release that the plan in force answers. -1 if no plan has arrived."""
 
     def __init__(self, context: LevelContext) -> None:
-        """Raise `LevelError` for an invalid parameter."""
+        """Read the parameters. Raises `LevelError` if one of them is invalid."""
         super().__init__(context)
         times_ms = read_params(FigureParams, context.params).process_ms
         if not isinstance(times_ms, tuple):
@@ -65,7 +67,7 @@ class FigureLoop(Executor):
         self._times_ns = [round(ms * NS_PER_MS) for ms in times_ms]
 
     def process(self, tick: int) -> None:
-        """Report, then compute; time spent preempted does not count."""
+        """Write the status, then consume X. Time while preempted does not count."""
         end = process_time_ns() + self._times_ns[tick // self.context.every % len(self._times_ns)]
         status = self.status
         status.state = State.EXECUTING
@@ -75,36 +77,36 @@ class FigureLoop(Executor):
 
 
 class FigureExecutor(FigureLoop):
-    """Reports which plan is in force, too."""
+    """Executor that also reports which plan is in force."""
 
     plan = Input(FigurePlan, "own.plan")
 
     def process(self, tick: int) -> None:
-        """Report, with the plan in force, then compute."""
+        """Note the newest plan, then write the status and consume X."""
         if self.plan.is_there:
             self.plan_in_use = self.plan.message.made_at
         super().process(tick)
 
 
 class FigurePlanner(Planner):
-    """Computes for P of processor time, then begins the next plan: one is always wanted."""
+    """Planner that consumes the processor time P per plan and always wants the next plan."""
 
     status = Input(FigureStatus, "own.status")
     output = Output(FigurePlan)
     params = FigureParams
 
     def __init__(self, context: LevelContext) -> None:
-        """Raise `LevelError` for an invalid parameter."""
+        """Read the parameters. Raises `LevelError` if one of them is invalid."""
         super().__init__(context)
         self._time_ns = round(read_params(FigureParams, context.params).plan_ms * NS_PER_MS)
 
     def wanted(self, tick: int) -> bool:
-        """Return True: a plan is always wanted."""
+        """Return True: the next plan is wanted as soon as the last one is finished."""
         return True
 
     def plan(self, tick: int) -> None:
-        """Report, then compute; time spent preempted does not count."""
-        end = process_time_ns() + self._time_ns
+        """Write the plan, then consume P. Time while preempted does not count."""
+        end_ns = process_time_ns() + self._time_ns
         self.output.made_at = tick
         self.output.cycle = self.status.message.cycle if self.status.is_there else -1
-        compute_until(end)
+        compute_until(end_ns)

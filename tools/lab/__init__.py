@@ -1,3 +1,4 @@
-"""What measures this project and reproduces the paper. Nothing outside the lab imports it, but for
-its commands.
+"""Measurements of this project and the reproduction of the paper.
+
+Only the commands of the lab import these packages.
 """

@@ -1,3 +1,4 @@
-"""The timing model applied to configs and recordings: changes that make a rack fit, and the
-response to an operator.
+"""The timing model applied to configs and recordings.
+
+It finds changes that make a rack fit, and measures the response to an operator.
 """

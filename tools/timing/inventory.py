@@ -1,5 +1,7 @@
-"""Inventory of a config: tasks, mailboxes with their bus addresses, host side, network, and what an
-arm does without torques.
+"""Inventory of a config.
+
+It lists the tasks, the mailboxes with their bus addresses, the host side and the network, and tells
+what an arm does without torques.
 """
 
 from __future__ import annotations
@@ -18,24 +20,30 @@ from rack.tools.console.answer import Document
 from rack.tools.console.tables import Blocks, TextTable
 
 PATIENCE = (
-    "patience: '{board}' goes on with its last torque for {ms:g} ms ({cycles} cycles; permitted:"
-    " {permitted_ms} ms). Meanwhile its joints at full speed turn {angle_mrad} mrad, and all motors"
-    " at full torque put in {energy_j} J"
+    "patience: '{board}' keeps its last torque for {ms:g} ms ({cycles} cycles; at most"
+    " {permitted_ms} ms). In this time joints at full speed turn {angle_mrad} mrad, and all motors"
+    " at full torque add {energy_j} J"
 )
 MONITORS = (
-    "monitors: '{board}' takes samples for good that are off by {position_mrad} mrad,"
+    "monitors: '{board}' accepts samples with errors of {position_mrad} mrad,"
     " {velocity_mrad_s} mrad/s; or, at full speed, {jitter_ms} ms early or late"
 )
 
 
 def inventory(config: RackConfig, layout: Layout, notes: list[str]) -> Document:
-    """Return the inventory of a config as plain data; addresses and sizes in bytes.
+    """Return the inventory of a config as plain data.
 
-    Of a task `slice_ms` is the time from its release until its messages are visible, of a mailbox
-    `delay_ms` the same; `depth` is the number of a mailbox's slots, `size` the bytes of one
-    message, `capacity` the most unread ones in a queue (0: no queue).
+    Addresses and sizes are in bytes. `slice_ms` of a task and `delay_ms` of a mailbox are the time
+    from a release until the messages are visible. `depth` is the number of slots of a mailbox,
+    `size` the size of one message, and `capacity` the largest number of unread messages in a queue,
+    or 0.
+
+    Args:
+        config: Config of the rack.
+        layout: Layout of its segment.
+        notes: Remarks to be shown.
     """
-    places = AddressMap(layout)
+    addresses = AddressMap(layout)
     tick_ms = layout.clock_ns * 1e-6
     tasks = [
         {
@@ -47,13 +55,13 @@ def inventory(config: RackConfig, layout: Layout, notes: list[str]) -> Document:
             "every_ticks": task.every,
             "phase_ticks": task.phase,
             "slice_ms": task.slice * tick_ms,
-            "trace_address": places.traces[task.name],
+            "trace_address": addresses.traces[task.name],
         }
         for task in sorted(layout.tasks, key=lambda t: (t.slot, t.role))
     ]
     mailboxes = [
         {
-            "address": places.mailboxes[mailbox.name],
+            "address": addresses.mailboxes[mailbox.name],
             "mailbox": mailbox.name,
             "message": f"{mailbox.message} {mailbox.version}",
             "size": mailbox.size,
@@ -72,8 +80,8 @@ def inventory(config: RackConfig, layout: Layout, notes: list[str]) -> Document:
         "clock_ms": tick_ms,
         "clock_core": config.clock.core,
         "clock_priority": config.clock.priority,
-        "segment_bytes": places.size,
-        "windows": {window.board: window.address for window in places.windows},
+        "segment_bytes": addresses.size,
+        "windows": {window.board: window.address for window in addresses.windows},
         "tasks": tasks,
         "hosts": [
             {
@@ -94,9 +102,7 @@ def inventory(config: RackConfig, layout: Layout, notes: list[str]) -> Document:
 
 
 def _patience(config: RackConfig, layout: Layout) -> Iterator[Document]:
-    """Yield how long an arm, or hand, goes on without a new torque, and what it does meanwhile,
-    joint by joint.
-    """
+    """Yield how long each arm or hand continues without a new torque, and how far it moves."""
     for board in [box.writer for box in layout.mailboxes if box.message == "arm_state"]:
         cell = built_cell(config)
         every = config.every(board)
@@ -114,52 +120,52 @@ def _patience(config: RackConfig, layout: Layout) -> Iterator[Document]:
 
 
 def _monitors(config: RackConfig) -> Iterator[Document]:
-    """Yield what the sensors of an arm may be off by before it is braked, joint by joint."""
+    """Yield the largest sensor errors that an arm accepts before it is braked, for each joint."""
     robot = config.robot
     if robot is None:
         return
-    # Importing MuJoCo takes 0.5 s: only racks with an arm pay for it.
+    # MuJoCo takes 0.5 s to import, therefore import it only for racks with an arm.
     from rack.levels.arm import find_arm
     from rack.levels.robot.cell import sensed_by
     from rack.levels.servo.control import ArmParams
     from rack.levels.servo.sensor_monitor import tolerance
 
-    for board, given in config.board.items():
-        kind = find_class(given.executor, Executor).params
+    for board, table in config.board.items():
+        kind = find_class(table.executor, Executor).params
         if kind is None or not issubclass(kind, ArmParams):
             continue
-        sensors = find_arm(read_params(kind, given.params).arm).sensors
+        sensors = find_arm(read_params(kind, table.params).arm).sensors
         cell = built_cell(config)
-        stands = tolerance(sensed_by(cell, robot, sensors))
+        limits = tolerance(sensed_by(cell, robot, sensors))
         yield {
             "board": board,
-            "position_mrad": (1e3 * stands.position).round(3).tolist(),
-            "velocity_mrad_s": (1e3 * stands.velocity).round(3).tolist(),
-            "jitter_ms": round(1e3 * stands.jitter_s, 3),
+            "position_mrad": (1e3 * limits.position).round(3).tolist(),
+            "velocity_mrad_s": (1e3 * limits.velocity).round(3).tolist(),
+            "jitter_ms": round(1e3 * limits.jitter_s, 3),
         }
 
 
 def _network(config: RackConfig) -> Document | None:
-    """Return with whom a rack exchanges what; None: with nobody."""
+    """Return the exchanges of a rack with others as plain data. None without a network."""
     table = config.adapter.lan
     if table is None:
         return None
     entries: list[Document] = []
-    for way, ports in (("out", table.exports), ("in", table.imports)):
+    for direction, ports in (("out", table.exports), ("in", table.imports)):
         for port, entry in ports.items():
-            place = {"entry": f"{LAN}.{port}", "way": way, "mailbox": entry.source}
-            entries.append(place | entry.model_dump(include={"rate_hz", "max_age_ms"}))
+            columns = {"entry": f"{LAN}.{port}", "way": direction, "mailbox": entry.source}
+            entries.append(columns | entry.model_dump(include={"rate_hz", "max_age_ms"}))
     keys = ("listen", "connect", "lease_ms", "on_peer_loss")
     return {**{key: getattr(table, key) for key in keys}, "peers": table.racks, "entries": entries}
 
 
-def inventory_blocks(found: Document) -> Blocks:
-    """Yield an inventory as text for people."""
-    boards = len({task["slot"] for task in found["tasks"]})
+def inventory_blocks(data: Document) -> Blocks:
+    """Yield an inventory as text for the terminal."""
+    boards = len({task["slot"] for task in data["tasks"]})
     crate = f"{boards} board{'s' * (boards > 1)} and the clock"
-    yield f"rack {found['rack']}: {crate}, {found['clock_ms']:g} ms, {found['mode']}"
-    yield from found["notes"]
-    has_phases = any(task["phase_ticks"] for task in found["tasks"])
+    yield f"rack {data['rack']}: {crate}, {data['clock_ms']:g} ms, {data['mode']}"
+    yield from data["notes"]
+    has_phases = any(task["phase_ticks"] for task in data["tasks"])
     rows = [
         {
             "slot": task["slot"],
@@ -172,19 +178,19 @@ def inventory_blocks(found: Document) -> Blocks:
             "slice, ms": task["slice_ms"],
             "trace at": _hex(task["trace_address"]),
         }
-        for task in found["tasks"]
+        for task in data["tasks"]
     ]
     clock = {
         **dict.fromkeys(rows[0], ""),
         "slot": CLOCK_SLOT,
         "task": "clock",
-        "core": found["clock_core"],
-        "FIFO": found["clock_priority"] or None,
+        "core": data["clock_core"],
+        "FIFO": data["clock_priority"] or None,
     }
     yield ""
     yield TextTable([clock, *rows], ("trace at", "slice, ms"))
-    yield from _host_blocks(found["hosts"])
-    yield from _network_blocks(found["network"])
+    yield from _host_blocks(data["hosts"])
+    yield from _network_blocks(data["network"])
     yield ""
     mailboxes = [
         {
@@ -193,7 +199,7 @@ def inventory_blocks(found: Document) -> Blocks:
             "message": mailbox["message"],
             "bytes": mailbox["size"],
             "slots": mailbox["depth"],
-            # Of a queue with its depth, as in `[protocol.depth]`.
+            # Show a queue with its depth, as in `[protocol.depth]`.
             "protocol": f"{mailbox['protocol']} of {mailbox['capacity']}"
             if mailbox["capacity"]
             else mailbox["protocol"],
@@ -202,18 +208,16 @@ def inventory_blocks(found: Document) -> Blocks:
                 f"{mailbox['writer']} > {spanned(mailbox['readers']) or '(nobody)'}"
             ),
         }
-        for mailbox in found["mailboxes"]
+        for mailbox in data["mailboxes"]
     ]
     yield TextTable(mailboxes, ("slots", "bytes", "message", "protocol"))
     yield ""
-    windows = ", ".join(f"{board} {_hex(address)}" for board, address in found["windows"].items())
-    yield f"segment: {found['segment_bytes']} bytes; board windows: {windows}"
+    windows = ", ".join(f"{board} {_hex(address)}" for board, address in data["windows"].items())
+    yield f"segment: {data['segment_bytes']} bytes; board windows: {windows}"
 
 
 def _host_blocks(hosts: Sequence[Document]) -> Blocks:
-    """Yield the boards of the host side: they have no rate, and the timing model leaves them
-    out.
-    """
+    """Yield a table of the host boards, which have no rate and no place in the timing model."""
     if hosts:
         rows = [
             {
@@ -229,7 +233,7 @@ def _host_blocks(hosts: Sequence[Document]) -> Blocks:
 
 
 def _network_blocks(network: Document | None) -> Blocks:
-    """Yield with whom a rack exchanges what, and what it does while one of them is lost."""
+    """Yield the peers and exchanges of a rack, and its reaction to a lost peer."""
     if network is None:
         return
     peers = ", ".join(network["peers"]) or "no rack in particular"
@@ -249,10 +253,10 @@ def _network_blocks(network: Document | None) -> Blocks:
     yield TextTable(rows)
 
 
-def arm_lines(found: Document) -> Iterator[str]:
-    """Yield what an arm does while no torque comes, and what its monitors take for good."""
-    yield from (PATIENCE.format(**one) for one in found["patience"])
-    yield from (MONITORS.format(**one) for one in found["monitors"])
+def arm_lines(data: Document) -> Iterator[str]:
+    """Yield the lines on the behaviour of an arm without torques and on its monitors."""
+    yield from (PATIENCE.format(**each) for each in data["patience"])
+    yield from (MONITORS.format(**each) for each in data["monitors"])
 
 
 def _hex(address: int) -> str:

@@ -1,6 +1,4 @@
-"""A config judged by the timing model, and a change of one of its boards, judged on the whole
-rack.
-"""
+"""A config judged by the timing model, and changes of single boards judged on the whole rack."""
 
 from __future__ import annotations
 
@@ -27,12 +25,12 @@ from rack.boards.timing.verdicts import (
 from rack.tools.console.answer import Document
 
 Settings = Mapping[str, Any]
-"""Keys of a board's table with their new values; None removes a key."""
+"""Keys of a board's table with their new values. None removes a key."""
 
 
 @dataclass(frozen=True)
 class JudgedConfig:
-    """A config that loads, as the timing model sees it, with the verdicts on it."""
+    """A valid config with its timing model and the verdicts on it."""
 
     config: RackConfig
     layout: Layout
@@ -41,14 +39,14 @@ class JudgedConfig:
 
     @classmethod
     def of(cls, config: RackConfig, budgets: Mapping[str, Budget] | None = None) -> JudgedConfig:
-        """Wire a config and judge it by `budgets`, or by its own. Raises `ConfigError`."""
+        """Wire a config and judge it by `budgets`, or by its own budgets. Raises `ConfigError`."""
         layout = resolve(config).layout
         timing = rack_timing(config, layout, budgets)
         return cls(config, layout, timing, tuple(verdicts(timing)))
 
     @property
     def budgets(self) -> dict[str, Budget]:
-        """The known budgets, by board."""
+        """Known budgets by board."""
         return {
             name: board.budget
             for name, board in self.timing.boards.items()
@@ -56,8 +54,10 @@ class JudgedConfig:
         }
 
     def change(self, board: str, settings: Settings) -> Change | None:
-        """Return the change to other settings of a board, with the config loaded anew and judged;
-        None if that is invalid.
+        """Change the settings of a board, and load and judge the new config.
+
+        Returns:
+            The change. None if the new config is invalid.
         """
         config = self.config
         table = config.board[board]
@@ -70,21 +70,22 @@ class JudgedConfig:
             mailboxes = {**config.protocol.mailbox, **protocols}
             update["protocol"] = config.protocol.model_copy(update={"mailbox": mailboxes})
         try:
-            # Copying validates nothing: only the loader finds mistakes.
+            # Copying does not validate. Only the loader finds mistakes.
             after = JudgedConfig.of(loads(config.model_copy(update=update).text()), self.budgets)
         except ConfigError:
             return None
-        own = {key: value for key, value in settings.items() if value != getattr(table, key)}
-        return Change(board, own, protocols, self, after)
+        changed = {key: value for key, value in settings.items() if value != getattr(table, key)}
+        return Change(board, changed, protocols, self, after)
 
     @property
     def failing(self) -> tuple[EquationVerdict, ...]:
-        """The verdicts that fail."""
+        """Verdicts that fail."""
         return tuple(verdict for verdict in self.verdicts if not verdict.holds)
 
     def failing_of(self, board: str) -> set[tuple[str, str, str]]:
-        """Return the keys of the failures of a board's own tasks; without any, of overloads of its
-        cores.
+        """Return the keys of the failures of a board's tasks.
+
+        If they have none, return the keys of overloads of the board's cores.
         """
         names = {board, f"{board}.planner"}
         own = {verdict.key for verdict in self.failing if verdict.subject in names}
@@ -92,18 +93,15 @@ class JudgedConfig:
         return own or {v.key for v in self.failing if v.equation == LOAD and v.subject in cores}
 
     def cures(self, board: str, before: JudgedConfig) -> bool:
-        """Return whether all failures of the board in `before` are gone, and no new ones have
-        appeared.
-        """
+        """Return True if no failure of a board in `before` is left and no new one has appeared."""
         failing = {verdict.key for verdict in self.failing}
         old = {verdict.key for verdict in before.failing}
         return failing < old and not failing & before.failing_of(board)
 
     def is_sound(self, changed: RackTiming, board: str) -> bool:
-        """Return whether one changed board satisfies its own equations and lets the system respond
-        as before.
+        """Return True if one changed board satisfies its equations without slowing the system.
 
-        This is a quick check; it leaves out the effect on other tasks on the core.
+        This check is quick and ignores the effect on other tasks of the core.
         """
         old = {verdict.key for verdict in self.failing}
         system = (verdict for verdict in system_verdicts(changed) if verdict.key not in old)
@@ -119,10 +117,10 @@ class Change:
 
     Attributes:
         board: Name of the board.
-        settings: Keys of its table that change, with their new values; None removes a key.
-        protocols: Mailboxes whose protocol changes, with the new one.
-        before: The rack before.
-        after: The rack after.
+        settings: Changed keys of its table with their new values. None removes a key.
+        protocols: New protocols of mailboxes.
+        before: The rack before the change.
+        after: The rack after the change.
     """
 
     board: str
@@ -133,32 +131,33 @@ class Change:
 
     @property
     def _levels(self) -> tuple[LevelTiming, LevelTiming]:
-        """The timing of its level, before and after."""
+        """Timing of the board's level before and after the change."""
         return self.before.timing.level(self.board), self.after.timing.level(self.board)
 
     @property
     def cost(self) -> tuple[bool, float, int, int]:
-        """The cost, for comparison: a core that this machine lacks, the slowdown, new cores and
-        slots, then keys.
+        """Cost for comparison with other changes.
 
-        A longer cycle makes a level slower and its plans older: both factors count.
+        Its parts are, in order of importance, a core that this machine lacks, the slowdown, the new
+        cores and slots, and the number of keys. A longer cycle makes a level slower and its plans
+        older, therefore both factors count.
         """
         cores = {*self.after.timing.cores.values()} - {*self.before.timing.cores.values()}
-        lacking = any(obtained_core(core) != core for core in cores)
+        is_core_missing = any(obtained_core(core) != core for core in cores)
         old, new = self._levels
         factor = new.cycle_ns / old.cycle_ns
         if old.slice_ns is not None and new.slice_ns is not None:
             factor *= max(new.slice_ns / old.slice_ns, 1.0)
-        places = 2 * len(cores) + ("planner_slot" in self.settings)
-        return lacking, factor, places, len(self.settings)
+        place_cost = 2 * len(cores) + ("planner_slot" in self.settings)
+        return is_core_missing, factor, place_cost, len(self.settings)
 
     @property
     def text(self) -> str:
-        """The change in one line, with its numbers."""
+        """The change with its numbers in one line."""
         return f"board '{self.board}': {', '.join(self._parts())}"
 
     def document(self) -> Document:
-        """Return it as plain data."""
+        """Convert the change to plain data."""
         return {
             "board": self.board,
             "text": self.text,
@@ -167,6 +166,7 @@ class Change:
         }
 
     def _parts(self) -> Iterator[str]:
+        """Yield a text for each part of the change."""
         old, new = (rack.config.board[self.board] for rack in (self.before, self.after))
         changed = self.settings
         for key in ("priority", "planner_priority"):
@@ -176,15 +176,15 @@ class Change:
             yield f"coupling {new.coupling}, planner_slot {new.planner_slot}"
         for key in ("planner_core", "core"):
             if (core := changed.get(key)) is not None:
-                was = "" if getattr(old, key) is None else f"{getattr(old, key)} -> "
-                yield f"{key} {was}{core} ({self._sharing(core)})"
+                before = "" if getattr(old, key) is None else f"{getattr(old, key)} -> "
+                yield f"{key} {before}{core} ({self._sharing(core)})"
         yield from (f"{mailbox} by {protocol}" for mailbox, protocol in self.protocols.items())
         yield from self._cycles()
         if changed.get("coupling") == "loose" and not self._levels[1].exchange_ns:
             yield "reading the plan over the bus is not counted: budget.exchange_ms is 0"
 
     def _cycles(self) -> Iterator[str]:
-        """Yield the change of the cycle, of the system's response, and of the age of plans."""
+        """Yield the changes of the cycle, of the system's response, and of the age of plans."""
         old, new = self._levels
         if new.cycle_ns != old.cycle_ns:
             ticks = [rack.timing.boards[self.board].every for rack in (self.before, self.after)]
@@ -201,12 +201,12 @@ class Change:
         yield age
 
     def _sharing(self, core: int) -> str:
-        """Return which other tasks are on a core, and whether this machine has it."""
-        own = (self.board, f"{self.board}.planner")
+        """Return which other tasks are on a core, and whether this machine has the core."""
+        own_tasks = (self.board, f"{self.board}.planner")
         others = [
             name
-            for name, place in self.after.timing.cores.items()
-            if place == core and name not in own
+            for name, task_core in self.after.timing.cores.items()
+            if task_core == core and name not in own_tasks
         ]
         sharing = f"shared with {', '.join(others)}" if others else "not shared"
         obtained = obtained_core(core)

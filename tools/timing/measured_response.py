@@ -23,17 +23,20 @@ from rack.tools.monitor.network import exchanged
 from rack.tools.recording.recording import Recording
 
 LOSSES = ("died", "hang")
-"""Codes of the events of a lost board."""
+"""Event codes of a lost board."""
 
 
 def system_response(recording: Recording) -> Document | None:
-    """Return the response down (commands) and up (statuses), in ticks and ms; None without a
-    hierarchy.
+    """Return the response of commands downward and of statuses upward, in ticks and ms.
 
-    It is that of the chains with the longest response; `others` holds the same for all other chains
-    of the rack. `beyond` are the responses longer than their bound, each with the delays that the
-    run shows; `unseen` counts those that cannot be measured because the recording lacks messages.
-    `crosses_racks`: the rack imports messages of others, of which the bounds know nothing.
+    The main figures belong to the chains with the longest response; `others` contains the same
+    figures for all other chains. `beyond` lists the responses that exceed their bound, with the
+    delays that the run shows. `unseen` counts responses that cannot be measured because the
+    recording lacks messages. `crosses_racks` is true if the rack imports messages of others, which
+    the bounds do not cover.
+
+    Returns:
+        The response as plain data. None without a hierarchy.
     """
     rack = rack_timing(recording.rack_config, recording.layout)
     first = rack.hierarchy
@@ -50,6 +53,7 @@ def system_response(recording: Recording) -> Document | None:
 
 
 def _response(recording: Recording, rack: RackTiming, chains: ParallelChains) -> Document:
+    """Return the response along parallel chains in both directions as plain data."""
     tick_ms = rack.clock_ns * 1e-6
     return {
         "subject": response_subject(rack, chains),
@@ -66,44 +70,55 @@ def _response(recording: Recording, rack: RackTiming, chains: ParallelChains) ->
 def _way(
     recording: Recording, rack: RackTiming, chains: Sequence[Sequence[str]], levels: Sequence[str]
 ) -> Document:
-    """Judge the response along all of these chains, from their first board's release to the last
-    one's cycle.
+    """Judge the response along chains, from the first board's release to the last one's cycle.
 
-    `levels` are those over which it is measured: after a level that does not pass the information
-    on, it begins anew.
+    Args:
+        recording: Recording of the run.
+        rack: Timing of the rack.
+        chains: Boards of each chain, in the direction of the information.
+        levels: Levels of the chains. The measurement restarts after a level that does not pass the
+            information on.
     """
     layout = recording.layout
-    ways = [(boards, mailboxes_along(layout, boards)) for boards in chains]
-    passed = min(len(mailboxes) for _, mailboxes in ways)
-    start = len(levels) - passed - 1 if passed else len(levels)
+    paths = [(boards, mailboxes_along(layout, boards)) for boards in chains]
+    hop_count = min(len(mailboxes) for _, mailboxes in paths)
+    start = len(levels) - hop_count - 1 if hop_count else len(levels)
     bound_ms = (
         max(rack.response_ticks(boards[start:]) for boards in chains) * layout.clock_ns * 1e-6
     )
-    found = [
-        _along(recording, boards[start:], boxes[-passed:], bound_ms)
-        for boards, boxes in ways
-        if passed and {box.name for box in boxes} <= set(recording.mailboxes)
+    measurements = [
+        _along(recording, boards[start:], boxes[-hop_count:], bound_ms)
+        for boards, boxes in paths
+        if hop_count and {box.name for box in boxes} <= set(recording.mailboxes)
     ]
-    seen = np.concatenate([np.zeros(0), *(ms for ms, _, _ in found)])
-    beyond = [each for _, late, _ in found for each in late]
+    responses_ms = np.concatenate([np.zeros(0), *(ms for ms, _, _ in measurements)])
+    beyond = [each for _, late, _ in measurements for each in late]
     return {
         "levels": list(levels[start:]),
-        "measured_ms": distribution(seen),
+        "measured_ms": distribution(responses_ms),
         "bound_ms": bound_ms,
-        "holds": not beyond if len(seen) else None,
+        "holds": not beyond if len(responses_ms) else None,
         "beyond": beyond,
-        "unseen": sum(unseen for _, _, unseen in found),
+        "unseen": sum(unseen for _, _, unseen in measurements),
     }
 
 
 def _along(
     recording: Recording, boards: Sequence[str], boxes: Sequence[MailboxSpec], bound_ms: float
 ) -> tuple[np.ndarray, list[Document], int]:
-    """Return the responses along one chain by its mailboxes, ms, those beyond the bound, and the
-    number unseen.
+    """Measure the responses along one chain.
 
-    The worst case is information that just misses a release whose message went all the way: it
-    waits for the next one that does.
+    The worst case is information that just misses a release whose message passed the whole chain.
+    It waits for the next release that does.
+
+    Args:
+        recording: Recording of the run.
+        boards: Boards of the chain.
+        boxes: Mailboxes between them.
+        bound_ms: Bound of the response, ms.
+
+    Returns:
+        The responses, ms, those beyond the bound, and the number that could not be measured.
     """
     layout = recording.layout
     mailbox = boxes[-1].name
@@ -111,35 +126,40 @@ def _along(
     tick_ms = layout.clock_ns * 1e-6
     basis = recording.signal(mailbox, "basis")
     visible_at = recording.signal(mailbox, "visible_at")
-    # A message that nothing had reached when it was written rests on its own tick: before all that
-    # counts here.
-    begun = max(int(recording.signal(box.name, "visible_at")[0]) for box in boxes)
-    real = np.flatnonzero(basis >= begun)
-    arrived, at = np.unique(basis[real], return_index=True)
-    at = real[at]
+    # The first messages rest only on their own ticks, because no information had arrived when they
+    # were written. They do not count.
+    first_basis = max(int(recording.signal(box.name, "visible_at")[0]) for box in boxes)
+    valid_rows = np.flatnonzero(basis >= first_basis)
+    arrived, at = np.unique(basis[valid_rows], return_index=True)
+    at = valid_rows[at]
     visible = visible_at[at[1:]]
     read = layout.read_grid(boxes[-1], boards[-1])
     acts = visible + (read.phase - visible) % read.every + last
     ms = (acts - arrived[:-1] - first) * tick_ms
-    seen = np.ones(len(ms), bool)
+    is_seen = np.ones(len(ms), bool)
     if recording.lost.get(mailbox) or recording.kept:
-        # The first message with the information may be among those that are not recorded.
+        # The first message with the information may be among the unrecorded ones.
         gaps = np.cumsum(np.diff(recording.signal(mailbox, "serial"), prepend=0) > 1)
-        seen = gaps[at[1:]] == gaps[at[:-1]]
+        is_seen = gaps[at[1:]] == gaps[at[:-1]]
     beyond = [
         {
             "tick": int(arrived[k]),
             "ms": round(float(ms[k]), 6),
             "delayed_by": list(_delays(recording, boards, int(arrived[k]), int(acts[k]))),
         }
-        for k in np.flatnonzero(seen & (ms > bound_ms + tick_ms / 2))
+        for k in np.flatnonzero(is_seen & (ms > bound_ms + tick_ms / 2))
     ]
-    return ms[seen], beyond, int(np.count_nonzero(~seen))
+    return ms[is_seen], beyond, int(np.count_nonzero(~is_seen))
 
 
 def _delays(recording: Recording, levels: Sequence[str], since: int, until: int) -> Iterator[str]:
-    """Yield the faults, losses and misses between two ticks of the levels that the information
-    passes.
+    """Yield the faults, losses and misses of some boards between two ticks.
+
+    Args:
+        recording: Recording of the run.
+        levels: Boards that the information passes.
+        since: First tick.
+        until: Tick after the last.
     """
     for fault in recording.ended.get("faults", ()):
         if 0 <= fault["began"] < until and not 0 <= fault["ends"] <= since:
@@ -152,7 +172,7 @@ def _delays(recording: Recording, levels: Sequence[str], since: int, until: int)
     yield from (f"{board} was lost" for board in dict.fromkeys(lost))
     for name in levels:
         rows = recording.trace(name)
-        last = until + recording.layout.task(name).every
-        missed, skipped = counts(rows[(rows["tick"] >= since) & (rows["tick"] < last)])
+        last_tick = until + recording.layout.task(name).every
+        missed, skipped = counts(rows[(rows["tick"] >= since) & (rows["tick"] < last_tick)])
         if missed or skipped:
             yield f"{name}: {missed} missed, {skipped} skipped"

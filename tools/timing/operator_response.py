@@ -1,8 +1,7 @@
-"""The response of a recorded run to its operator: from giving a command to the torque that rests on
-it.
+"""The response of a recorded run to its operator.
 
-Causality is measured, not inferred: every command and status carries the serial of the newest
-operator command that it rests on.
+It lasts from giving a command to the torque that rests on it. Causality is measured, not inferred:
+every command and status carries the serial of the newest operator command on which it rests.
 """
 
 from __future__ import annotations
@@ -27,11 +26,11 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 Fate = Literal["acted on", "refused", "superseded", "run over"]
+# Colours of Okabe and Ito's palette, which colour-blind readers can distinguish.
 MEASURED = "#0072b2"
 GRID = "#009e73"
 SUM = "#e69f00"
 BOUND = "#d55e00"
-"""Colours of Okabe and Ito's palette, distinguishable to colour-blind readers."""
 FIGURES = {
     "min": "min_ms",
     "median": "median_ms",
@@ -41,20 +40,28 @@ FIGURES = {
     "sum, eq. 3.3": "sum_eq_3_3_ms",
     "bound, eq. 3.2": "bound_eq_3_2_ms",
 }
-"""Columns of the table, and the figure of a level that each shows."""
+"""Columns of the table, and the figure of a level that each of them shows."""
 BINS = 20
-"""Bars of a histogram up to the longest response on the grid."""
+"""Number of histogram bars up to the longest response on the grid."""
 ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
 class AnsweredCommand:
-    """One command, in ticks. `predicted` and `acts` are releases of the cycle whose torque rests on
-    it.
+    """One command. Times are ticks.
 
-    `acts` is None if no cycle rests on this very command: it was refused, a newer one overtook it,
-    or the run ended first. `wall_ms` is the response by the wall clock, from giving the command to
-    writing the status of that cycle.
+    Attributes:
+        serial: Serial of the command.
+        level: Level that was commanded.
+        what: Name of the operation.
+        given: Tick at which it was given.
+        sampled: Release at which the level reads it.
+        predicted: Predicted release of the cycle whose torque rests on it.
+        acts: Measured release of this cycle. None if no cycle rests on this very command, because
+            it was refused, a newer one overtook it, or the run ended first.
+        fate: Outcome of the command.
+        wall_ms: Response by the wall clock, from giving the command to writing the status of that
+            cycle, ms. None in lockstep.
     """
 
     serial: int
@@ -70,8 +77,13 @@ class AnsweredCommand:
 
 @dataclass(frozen=True)
 class OperatorResponse:
-    """The response of a run. `tick_ms` is simulated time; `paths` are by level, for every level
-    that was commanded.
+    """The response of a run.
+
+    Attributes:
+        tick_ms: Simulated time of a tick, ms.
+        lockstep: Whether the run was in lockstep.
+        paths: Path of commands for every level that was commanded.
+        commands: All commands.
     """
 
     tick_ms: float
@@ -81,18 +93,19 @@ class OperatorResponse:
 
     @property
     def measured(self) -> list[AnsweredCommand]:
-        """The commands that some torque rests on."""
+        """Commands on which a torque rests."""
         return [command for command in self.commands if command.acts is not None]
 
     def ticks(self, command: AnsweredCommand) -> int:
-        """Return the measured response of one of `measured`, ticks."""
+        """Return the response to one of the measured commands, ticks."""
         assert command.acts is not None, "it was acted on"
         return self.paths[command.level].response(command.given, command.acts)
 
     @property
     def beyond(self) -> list[AnsweredCommand]:
-        """The commands whose response exceeded a bound: the longest on the grid, or eq. 3.2 from
-        the release on.
+        """Commands whose response exceeded a bound.
+
+        The bounds are the longest response on the grid, and equation 3.2 from the release on.
         """
         return [command for command in self.measured if self._is_beyond(command)]
 
@@ -104,34 +117,34 @@ class OperatorResponse:
 
     @property
     def off(self) -> list[AnsweredCommand]:
-        """The commands acted on at another tick than predicted; only exact paths predict a tick."""
+        """Commands that took effect at another tick than predicted.
+
+        Only exact paths are compared.
+        """
         exact = [c for c in self.measured if self.paths[c.level].is_exact]
         return [command for command in exact if command.acts != command.predicted]
 
     @property
     def held(self) -> bool:
-        """Whether no response exceeded a bound and, in lockstep, each came at the predicted
-        tick.
-        """
+        """Whether all responses are within bounds and, in lockstep, at the predicted ticks."""
         return not self.beyond and not (self.lockstep and self.off)
 
     def rows(self) -> list[Document]:
-        """Return the figures of every level that was commanded, ms of simulated time, as plain
-        data.
-        """
+        """Return the figures of every level that was commanded, ms of simulated time."""
         return [self._row(level, path) for level, path in self.paths.items()]
 
     def _row(self, level: str, path: CommandPath) -> Document:
-        own = [c for c in self.measured if c.level == level]
-        ms = np.array([self.ticks(c) for c in own]) * self.tick_ms
-        waits_ms = np.array([c.sampled - c.given for c in own]) * self.tick_ms
-        given = distribution(ms) or {}
+        """Return the figures of one level, ms of simulated time."""
+        commands = [c for c in self.measured if c.level == level]
+        ms = np.array([self.ticks(c) for c in commands]) * self.tick_ms
+        waits_ms = np.array([c.sampled - c.given for c in commands]) * self.tick_ms
+        stats = distribution(ms) or {}
         return {
             "level": level,
-            "commands": len(own),
-            "min_ms": given.get("min"),
-            "median_ms": given.get("p50"),
-            "max_ms": given.get("max"),
+            "commands": len(commands),
+            "min_ms": stats.get("min"),
+            "median_ms": stats.get("p50"),
+            "max_ms": stats.get("max"),
             "max_from_reading_ms": (distribution(ms - waits_ms) or {}).get("max"),
             "longest_ms": path.longest * self.tick_ms,
             "sum_eq_3_3_ms": path.sum_eq_3_3 * self.tick_ms,
@@ -141,7 +154,7 @@ class OperatorResponse:
         }
 
     def document(self) -> Document:
-        """Return everything as plain data."""
+        """Convert the response to plain data."""
         return {
             "lockstep": self.lockstep,
             "tick_ms": self.tick_ms,
@@ -157,10 +170,10 @@ class OperatorResponse:
         }
 
     def blocks(self) -> Blocks:
-        """Yield the figures as text for people."""
+        """Yield the figures as text for the terminal."""
         yield (
-            f"response to {len(self.measured)} operator commands, ms of simulated time: from giving"
-            " a command, and"
+            f"response to {len(self.measured)} operator commands, ms of simulated time:"
+            " from giving a command, and"
         )
         yield "from the release that reads it, to the end of the cycle whose torque rests on it"
         rows = [
@@ -187,12 +200,12 @@ class OperatorResponse:
 
 
 def response_of(recording: Recording) -> OperatorResponse | None:
-    """Return the response of a run; None if no operator commanded a level of its hierarchy."""
+    """Measure the response of a run. None if no operator commanded a level of its hierarchy."""
     config = recording.rack_config
     layout = recording.layout
-    found = command_paths(rack_timing(config, layout), layout)
+    known = command_paths(rack_timing(config, layout), layout)
     paths = {
-        level: path for level, path in found.items() if f"{level}.operator" in recording.mailboxes
+        level: path for level, path in known.items() if f"{level}.operator" in recording.mailboxes
     }
     if not paths:
         return None
@@ -209,14 +222,21 @@ def response_of(recording: Recording) -> OperatorResponse | None:
 def _answered(
     recording: Recording, level: str, path: CommandPath, lockstep: bool
 ) -> Iterator[AnsweredCommand]:
-    """Yield the commands given to a level, each with the first cycle of the lowest level that rests
-    on it, if any.
+    """Yield the commands given to a level.
+
+    Each has the first cycle of the lowest level that rests on it, if there is one.
+
+    Args:
+        recording: Recording of the run.
+        level: Level that was commanded.
+        path: Path of a command from this level to the lowest one.
+        lockstep: Whether the run was in lockstep.
     """
     box = f"{level}.operator"
-    # A clock that died while giving a command has given it twice: the first one counts.
-    serials, at = np.unique(recording.signal(box, "id"), return_index=True)
+    # A clock that died while giving a command has given it twice. The first one counts.
+    serials, rows = np.unique(recording.signal(box, "id"), return_index=True)
     whats, given, visible, stamps = (
-        recording.signal(box, n)[at] for n in ("what", "tick", "visible_at", "stamp_ns")
+        recording.signal(box, n)[rows] for n in ("what", "tick", "visible_at", "stamp_ns")
     )
     orders, answers = (recording.signal(f"{level}.status", n) for n in ("order", "answer"))
     refused = set(orders[answers == Answer.REFUSED].tolist())
@@ -224,17 +244,17 @@ def _answered(
         recording.signal(f"{path.levels[-1]}.status", n) for n in ("operator", "tick", "stamp_ns")
     )
     for serial, what, tick, seen, stamp in zip(serials, whats, given, visible, stamps, strict=True):
-        reached = np.flatnonzero(basis >= serial)
+        resting_rows = np.flatnonzero(basis >= serial)
         fate: Fate = "run over"
         acts = wall_ms = None
         if int(serial) in refused:
             fate = "refused"
-        elif len(reached) and basis[reached[0]] != serial:
+        elif len(resting_rows) and basis[resting_rows[0]] != serial:
             fate = "superseded"
-        elif len(reached):
+        elif len(resting_rows):
             fate = "acted on"
-            acts = int(ticks[reached[0]])
-            wall_ms = round((int(written[reached[0]]) - int(stamp)) * 1e-6, 6)
+            acts = int(ticks[resting_rows[0]])
+            wall_ms = round((int(written[resting_rows[0]]) - int(stamp)) * 1e-6, 6)
         yield AnsweredCommand(
             serial=int(serial),
             level=level,
@@ -249,16 +269,24 @@ def _answered(
 
 
 def show(recording: Recording, folder: Path, as_json: bool) -> bool:
-    """Print the response of a run and write response.json and its pictures into `folder`; return
-    whether it held.
+    """Print the response of a run, and write response.json and its pictures.
 
-    Raises `Failure` if no operator commanded a level.
+    Args:
+        recording: Recording of the run.
+        folder: Folder for the files.
+        as_json: Whether to print JSON.
+
+    Returns:
+        True if all responses are within their bounds.
+
+    Raises:
+        Failure: If no operator commanded a level.
     """
     response = response_of(recording)
     if response is None:
-        why = "no operator commanded a level of its hierarchy"
         raise Failure(
-            f"{recording.folder}: {why}; see 'rack command' and [[command]]",
+            f"{recording.folder}: no operator commanded a level of its hierarchy;"
+            " see 'rack command' and [[command]]",
             2,
         )
     folder.mkdir(parents=True, exist_ok=True)
@@ -277,8 +305,10 @@ def show(recording: Recording, folder: Path, as_json: bool) -> bool:
 
 
 def plot(response: OperatorResponse, folder: Path) -> list[Path]:
-    """Write response.png and response.svg, a histogram per level with its bounds, into `folder`;
-    return their paths.
+    """Write a histogram per level with its bounds to response.png and response.svg.
+
+    Returns:
+        Paths of the pictures.
     """
     levels = [level for level in response.paths if any(c.level == level for c in response.measured)]
     paths = paths_of(folder / "response")
@@ -315,14 +345,14 @@ def _plot_level(axis: Axes, response: OperatorResponse, level: str) -> None:
         ),
     )
     values = [response.ticks(c) * tick_ms if c.wall_ms is None else c.wall_ms for c in own]
-    end = max(lines[2][0], *values)
-    # A value equal to the longest is drawn left of that line, despite rounding.
-    width = path.longest * tick_ms / BINS
-    edges = np.arange(0.0, end + width, width) * (1.0 + ROUNDING)
+    end_ms = max(lines[2][0], *values)
+    # Draw a value equal to the longest on the grid to the left of its line, despite rounding.
+    width_ms = path.longest * tick_ms / BINS
+    edges = np.arange(0.0, end_ms + width_ms, width_ms) * (1.0 + ROUNDING)
     axis.hist(values, bins=edges.tolist(), color=MEASURED, label="measured")
-    for at, colour, style, label in lines:
-        axis.axvline(at, color=colour, linestyle=style, label=label)
-    axis.set_xlim(0.0, 1.04 * end)
+    for at_ms, colour, style, label in lines:
+        axis.axvline(at_ms, color=colour, linestyle=style, label=label)
+    axis.set_xlim(0.0, 1.04 * end_ms)
     axis.set_ylabel("commands")
     axis.yaxis.set_major_locator(MaxNLocator(integer=True))
     axis.set_title(f"{' > '.join(path.levels)}: {len(own)} commands", fontsize="small", loc="left")

@@ -1,5 +1,7 @@
-"""What a check says first: does the rack fit, where is it tightest, how soon does it respond, what
-can its arm do, and what to do about it.
+"""Summary of a check.
+
+It tells whether the rack fits, where it is tightest, how soon it responds, the abilities of its
+arm, and the changes that would make it fit.
 """
 
 from __future__ import annotations
@@ -14,11 +16,11 @@ from rack.tools.timing.repair import Repair
 from rack.tools.timing.tables import side_text, verdict_table
 
 if TYPE_CHECKING:
-    # Importing MuJoCo takes 0.5 s: only racks with an arm pay for it.
+    # MuJoCo takes 0.5 s to import, therefore import it only for racks with an arm.
     from rack.levels.robot.abilities import Abilities
 
 RESPONSES = "3.2", "3.3"
-"""Equations of the system's response."""
+"""Equations of the response of the system."""
 
 
 def summary_blocks(
@@ -28,14 +30,14 @@ def summary_blocks(
     joints: Sequence[str],
     measuring: str,
 ) -> Blocks:
-    """Yield the summary as text for people, with every verdict that fails.
+    """Yield the summary as text for the terminal, with every verdict that fails.
 
     Args:
         forecast: Timing of the rack.
         fitting: Changes that make it fit.
-        arm: Abilities of the arm; None for a rack without one.
+        arm: Abilities of the arm. None for a rack without one.
         joints: Names of the arm's joints.
-        measuring: Command that measures budgets; empty if they were measured.
+        measuring: Command that measures budgets. Empty if they were measured.
     """
     yield from _verdict(forecast, measuring)
     failing = [verdict for verdict in forecast.verdicts if not verdict.holds]
@@ -62,52 +64,55 @@ def summary_blocks(
 
 
 def _verdict(forecast: Forecast, measuring: str) -> Iterator[str]:
-    """Yield whether the rack fits, and whatever was not counted for that."""
+    """Yield whether the rack fits, and everything that was not counted."""
     names: dict[str, list[str]] = {}
     for name, why in forecast.uncounted.items():
         names.setdefault(why, []).append(f"'{name}'")
-    left_out = ", ".join(f"{', '.join(those)} ({why})" for why, those in names.items())
+    left_out = ", ".join(f"{', '.join(boards)} ({why})" for why, boards in names.items())
     silent = names.get(NO_BUDGET)
     command = ""
     if silent and measuring:
         command = f": measure {'it' if len(silent) == 1 else 'them'} by: {measuring}"
     count = len(forecast.verdicts)
     if failing := sum(not verdict.holds for verdict in forecast.verdicts):
-        rest = f"; not counted: {left_out}{command}" if left_out else ""
-        yield f"does not fit: {failing} of {count} equations and bounds fail{rest}"
+        exceptions = f"; not counted: {left_out}{command}" if left_out else ""
+        yield f"does not fit: {failing} of {count} equations and bounds fail{exceptions}"
         return
-    held = f"all {count} equations and bounds hold; not counted: the recorder"
+    hold_text = f"all {count} equations and bounds hold; not counted: the recorder"
     if not forecast.rack.levels:
         yield f"fits, as far as is known: no board has a budget{command}"
     elif left_out:
         yield f"fits, without {left_out}{command}"
-        yield held
+        yield hold_text
     else:
-        yield f"fits: {held}"
+        yield f"fits: {hold_text}"
 
 
 def tightest(verdicts: Sequence[EquationVerdict]) -> Iterator[str]:
-    """Yield the verdict with the least part of its right side left; an equality has no margin, and
-    the system's response is exact.
+    """Yield the verdict whose right side has the smallest fraction left.
+
+    Equalities are left out because they have no margin, and the response of the system because it
+    is exact.
     """
     bounds = [
-        found
-        for found in verdicts
-        if found.sign != "=" and found.equation not in RESPONSES and found.right > 0.0
+        verdict
+        for verdict in verdicts
+        if verdict.sign != "=" and verdict.equation not in RESPONSES and verdict.right > 0.0
     ]
     if bounds:
-        yield f"tightest: {_margin(min(bounds, key=lambda found: found.margin / found.right))}"
+        yield f"tightest: {_margin(min(bounds, key=lambda each: each.margin / each.right))}"
 
 
 def _margin(verdict: EquationVerdict) -> str:
+    """Format the margin of a verdict, such as "servo, eq. 3.1: 1 of 2.5 ms, 60% left"."""
     if verdict.endless:
         return verdict.endless
-    what = verdict.equation
-    if what in EQUATIONS:
-        what = f"eq. {what}".replace("eq. fig.", "fig.")
-    left = side_text(verdict.left, verdict.unit)
-    right = side_text(verdict.right, verdict.unit)
+    criterion = verdict.equation
+    if criterion in EQUATIONS:
+        criterion = f"eq. {criterion}".replace("eq. fig.", "fig.")
+    left_side = side_text(verdict.left, verdict.unit)
+    right_side = side_text(verdict.right, verdict.unit)
     unit = " ms" if verdict.unit == "ns" else ""
-    part = verdict.margin / verdict.right
-    rest = f"{part:.0%} left" if part >= 0.0 else f"{-part:.0%} too much"
-    return f"{verdict.subject}, {what}: {left} of {right}{unit}, {rest}"
+    fraction = verdict.margin / verdict.right
+    remainder = f"{fraction:.0%} left" if fraction >= 0.0 else f"{-fraction:.0%} too much"
+    return f"{verdict.subject}, {criterion}: {left_side} of {right_side}{unit}, {remainder}"

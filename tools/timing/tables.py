@@ -1,5 +1,6 @@
-"""A forecast as text: the system's response, and tables of levels, verdicts and response times;
-times in ms.
+"""A forecast as text, with times in ms.
+
+It shows the response of the system, and tables of levels, verdicts and response times.
 """
 
 from __future__ import annotations
@@ -17,13 +18,13 @@ from rack.boards.timing.verdicts import BEYOND, PLAN_WITHIN, EquationVerdict
 from rack.tools.console.tables import Blocks, Cell, TextTable, ms
 
 TABLED = {*BEYOND} - {PLAN_WITHIN}
-"""Criteria that have a table of their own."""
+"""Criteria that have separate tables."""
 RESULTS = {True: "ok", False: "FAILS"}
 Row = dict[str, Cell]
 
 
 def forecast_blocks(forecast: Forecast) -> Blocks:
-    """Yield a forecast as text for people."""
+    """Yield a forecast as text for the terminal."""
     rack = forecast.rack
     system = forecast.system
     if system.levels:
@@ -61,7 +62,7 @@ def forecast_blocks(forecast: Forecast) -> Blocks:
 
 
 def _schedule_blocks(forecast: Forecast) -> Blocks:
-    """Yield a line per board of every distinct frame of a static schedule."""
+    """Yield a table of a static schedule, with a row per board of every distinct frame."""
     if forecast.rack.schedule is None:
         return
     minor, major = forecast.rack.schedule
@@ -89,8 +90,11 @@ def _schedule_blocks(forecast: Forecast) -> Blocks:
 
 
 def _numbers(frames: Sequence[int], count: int) -> str:
-    """Return the numbers of frames as text, those at equal distances by the first two and the
-    last.
+    """Format the numbers of frames. Equidistant ones are shortened to the first two and the last.
+
+    Args:
+        frames: Numbers in ascending order.
+        count: Number of all frames.
     """
     if len(frames) == count:
         return "all"
@@ -103,11 +107,11 @@ def _numbers(frames: Sequence[int], count: int) -> str:
 
 
 def level_table(levels: Iterable[tuple[str, LevelTiming]], about: str) -> TextTable:
-    """Return a line per level: its cycle, its parts, and the residual for its planner; times in ms.
+    """Build a table with a row per level: its cycle, the parts of it, and the residual, ms.
 
     Args:
         levels: Levels, each with a word about it.
-        about: Head of the column of these words.
+        about: Heading of the column of these words.
     """
     rows: Iterable[Row] = (
         {
@@ -132,8 +136,11 @@ def level_table(levels: Iterable[tuple[str, LevelTiming]], about: str) -> TextTa
 
 
 def verdict_table(verdicts: Iterable[tuple[str, EquationVerdict]]) -> TextTable:
-    """Return a line per verdict: both sides, the margin, whether it holds. Each comes with the side
-    that it is of, predicted or measured; "": the table needs none.
+    """Build a table with a row per verdict: both sides, the margin, and whether it holds.
+
+    Args:
+        verdicts: Verdicts, each with its side, "predicted" or "measured". The table has no column
+            of sides if they are empty.
     """
     rows: Iterable[Row] = (
         {
@@ -153,14 +160,14 @@ def verdict_table(verdicts: Iterable[tuple[str, EquationVerdict]]) -> TextTable:
 
 
 def side_text(value: float, unit: str) -> str:
-    """Return a side of an equation: a time in ms, anything else with three digits."""
+    """Format one side of an equation. A time is in ms, anything else has three digits."""
     if isinf(value):
         return "endless" if value > 0 else "-"
     return ms(value) if unit == "ns" else f"{value:.3g}"
 
 
 def _response_table(responses: Iterable[TaskResponse]) -> TextTable:
-    """Return a line per task that shares a core: its worst case by priority."""
+    """Build a table with a row per task that shares a core, with its worst case by priority."""
     rows: Iterable[Row] = (
         {
             "core": response.core,
@@ -177,13 +184,13 @@ def _response_table(responses: Iterable[TaskResponse]) -> TextTable:
             ),
             "": RESULTS[response.holds],
         }
-        for response in sorted(responses, key=lambda one: (one.core, -one.priority))
+        for response in sorted(responses, key=lambda task: (task.core, -task.priority))
     )
     return TextTable(merge_rows(rows, "task"), ("FIFO", "margin"))
 
 
 def _inbox_table(inboxes: Iterable[Mapping[str, Any]]) -> TextTable:
-    """Return a line per board that messages interrupt: what they cost it, and its worst burst."""
+    """Build a table with a row per interrupted board, with the cost and the worst burst."""
     rows: Iterable[Row] = (
         {
             "board": inbox["task"],
@@ -201,10 +208,11 @@ def _inbox_table(inboxes: Iterable[Mapping[str, Any]]) -> TextTable:
 
 
 def merge_rows(rows: Iterable[Mapping[str, Any]], name: str) -> list[dict[str, Any]]:
-    """Return the rows, those that differ only in the column `name` as one: a board a joint fills no
-    page.
+    """Merge rows that differ only in the column `name`.
+
+    Otherwise a rack with a board per joint would fill a page.
     """
     names: dict[tuple[tuple[str, Any], ...], list[str]] = {}
     for row in rows:
         names.setdefault(tuple({**row, name: ""}.items()), []).append(str(row[name]))
-    return [{**dict(alike), name: spanned(found)} for alike, found in names.items()]
+    return [{**dict(common), name: spanned(merged)} for common, merged in names.items()]

@@ -1,5 +1,6 @@
-"""State tables: levels whose executors are tables in TOML files, with static plans and no
-planners.
+"""Levels programmed by state tables.
+
+Their executors follow tables in TOML files. Plans are static, and no planner runs.
 """
 
 from rack.levels.systems.state_table.elemental_move import MoveTable

@@ -1,9 +1,9 @@
-"""The check of a state table: unknown words, unreachable states, overlapping rows, cases that no
-row takes.
+"""Check of a state table before the launch.
 
-The cases of a state are the combinations of the values of all conditions that its rows name. A set
-of cases is kept as boxes, a set of values per condition each; what a row leaves of a box are at
-most as many boxes as it has conditions.
+It finds unknown words, unreachable states, overlapping rows and cases that no row takes. The cases
+of a state are all combinations of the values of the conditions that its rows name. A set of cases
+is stored as a list of boxes, and a box has a set of values for each condition. Subtracting a row
+from a box leaves at most as many boxes as the row has conditions.
 """
 
 from __future__ import annotations
@@ -23,27 +23,31 @@ from rack.levels.systems.state_table.table import (
 from rack.levels.tables import keys_of
 
 Box = dict[str, frozenset[str]]
-"""A set of cases: the values permitted by condition."""
+"""A set of cases: the permitted values of each condition."""
 REASONED = ("error", "holding")
-"""Values of `status` that need a reason."""
+"""Values of `status` for which a row must give a reason."""
 MAX_HOLES = 3
-"""Holes of one state that are reported one by one."""
+"""Number of uncovered cases of one state that are listed individually."""
 
 
 def flaws(table: StateTable, vocabulary: Vocabulary, lexicon: Lexicon | None) -> list[str]:
-    """Return every mistake in a table, a line each, with the number and name of the row.
+    """Return one line for every mistake in a table, with the number and name of the row.
 
-    Without a lexicon, since the plan has mistakes, actions are not checked.
+    Args:
+        table: Table to check.
+        vocabulary: Conditions, commands and actions of the level.
+        lexicon: Sets of words that depend on the plan. None if the plan has mistakes; actions are
+            then not checked.
     """
-    found = [*table.flaws]
+    lines = [*table.flaws]
     for number, row in table.configs.items():
-        found += [f"{_named(number, row)}: {why}" for why in _words(row, vocabulary, lexicon)]
-    found += _states(table)
+        lines += [f"{_named(number, row)}: {why}" for why in _words(row, vocabulary, lexicon)]
+    lines += _states(table)
     # Cases can be counted only once every condition and value is known, and every row is readable.
     if not table.flaws and not any(_conditions(row, vocabulary) for row in table.configs.values()):
         for state in table.rows:
-            found += _cases(state, table.rows[state], vocabulary)
-    return found
+            lines += _cases(state, table.rows[state], vocabulary)
+    return lines
 
 
 def _named(number: int, row: RowConfig) -> str:
@@ -51,7 +55,7 @@ def _named(number: int, row: RowConfig) -> str:
 
 
 def _words(row: RowConfig, vocabulary: Vocabulary, lexicon: Lexicon | None) -> Iterator[str]:
-    """Yield unknown words of a row, and outputs that it lacks."""
+    """Yield unknown words of a row, and required keys that it lacks."""
     yield from _conditions(row, vocabulary)
     for phrase in row.do:
         if lexicon is not None and (why := objection(phrase, vocabulary.actions, lexicon)):
@@ -64,28 +68,28 @@ def _words(row: RowConfig, vocabulary: Vocabulary, lexicon: Lexicon | None) -> I
     if row.status in REASONED and not row.reason and "status" in row.model_fields_set:
         yield f"reason: missing; status {row.status} needs one, a line for the user"
     if row.status not in REASONED and row.reason:
-        yield f"reason: status {row.status} shows none; statuses that do: {', '.join(REASONED)}"
+        yield (f"reason: status {row.status} shows none; statuses that do: {', '.join(REASONED)}")
 
 
 def _conditions(row: RowConfig, vocabulary: Vocabulary) -> list[str]:
-    """Return the unknown conditions and values of a row."""
-    found = []
+    """Return a line for each unknown condition or value in a row."""
+    lines = []
     for condition, values in row.when.items():
         if condition not in vocabulary.conditions:
             known = ", ".join(vocabulary.conditions)
-            found.append(f"when: unknown condition '{condition}'; known: {known}")
+            lines.append(f"when: unknown condition '{condition}'; known: {known}")
             continue
         permitted = vocabulary.conditions[condition]
         unknown = [f"is never '{value}'" for value in values if value not in permitted]
         if not values:
             unknown = ["has an empty list"]
-        its_values = ", ".join(permitted)
-        found += [f"when: {condition} {why}; its values: {its_values}" for why in unknown]
-    return found
+        valid = ", ".join(permitted)
+        lines += [f"when: {condition} {why}; its values: {valid}" for why in unknown]
+    return lines
 
 
 def _states(table: StateTable) -> Iterator[str]:
-    """Yield next states that do not exist, and states that no row leads to."""
+    """Yield next states that do not exist, and states that are unreachable from the start."""
     names = [*table.rows]
     known = ", ".join(names)
     if SAME in names:
@@ -94,11 +98,13 @@ def _states(table: StateTable) -> Iterator[str]:
         yield f"start: no row has the state '{table.start}'; states: {known}"
     for number, row in table.configs.items():
         if row.next not in (*names, SAME):
-            yield f"{_named(number, row)}: next: no row has the state '{row.next}'; states: {known}"
+            yield (
+                f"{_named(number, row)}: next: no row has the state '{row.next}'; states: {known}"
+            )
     if table.start not in names:
         return
     reached = [table.start]
-    for state in reached:  # grows on the way
+    for state in reached:  # the list grows while it is read
         nexts = {row.next for row in table.rows[state].values()}
         reached += [name for name in names if name in nexts and name not in reached]
     for state in names:
@@ -111,47 +117,52 @@ def _states(table: StateTable) -> Iterator[str]:
 
 
 def _cases(state: str, rows: Mapping[int, RowConfig], vocabulary: Vocabulary) -> Iterator[str]:
-    """Yield overlaps of the rows of one state, rows that never fire, and cases that no row
-    takes.
+    """Yield overlapping rows of a state, rows that never fire, and cases that no row takes.
+
+    Args:
+        state: Name of the state.
+        rows: Its rows by number, in the order in which they are tried.
+        vocabulary: Gives the values of each condition.
     """
-    named = [
+    conditions = [
         name for name in vocabulary.conditions if any(name in row.when for row in rows.values())
     ]
-    every: Box = {name: frozenset(vocabulary.conditions[name]) for name in named}
-    boxes: dict[int, Box] = {}  # of the rows above, by number
-    left = [every]
+    all_cases: Box = {name: frozenset(vocabulary.conditions[name]) for name in conditions}
+    boxes: dict[int, Box] = {}  # earlier rows, by number
+    uncovered = [all_cases]
     for number, row in rows.items():
-        here = _named(number, row)
-        box = {**every, **{name: frozenset(values) for name, values in row.when.items()}}
-        for other, above in boxes.items():
-            both = {name: values & above[name] for name, values in box.items()}
-            if not row.otherwise and all(both.values()):
-                before = rows[other]
-                shared = {n: both[n] for n in named if n in row.when or n in before.when}
+        row_name = _named(number, row)
+        box = {**all_cases, **{name: frozenset(values) for name, values in row.when.items()}}
+        for earlier_number, earlier_box in boxes.items():
+            overlap = {name: values & earlier_box[name] for name, values in box.items()}
+            if not row.otherwise and all(overlap.values()):
+                earlier = rows[earlier_number]
+                shared = {n: overlap[n] for n in conditions if n in row.when or n in earlier.when}
                 yield (
-                    f"{here}: overlaps {_named(other, before)} in '{state}' when"
-                    f" {_listed(shared)}; let them exclude each other, or give the later one else ="
-                    " true"
+                    f"{row_name}: overlaps {_named(earlier_number, earlier)} in '{state}'"
+                    f" when {_listed(shared)}; let them exclude each other, or give the later one"
+                    " else = true"
                 )
-        rest = [piece for whole in left for piece in without(whole, box)]
-        if row.otherwise and rest == left:
-            yield f"{here}: never fires in '{state}': the rows above it take every case of it"
-        left = rest
+        rest = [piece for box_left in uncovered for piece in without(box_left, box)]
+        if row.otherwise and rest == uncovered:
+            yield f"{row_name}: never fires in '{state}': the rows above it take every case of it"
+        uncovered = rest
         boxes[number] = box
-    left = joined(left)
-    for box in left[:MAX_HOLES]:
+    uncovered = joined(uncovered)
+    for box in uncovered[:MAX_HOLES]:
         yield f"hole: no row of '{state}' takes {_described(box, vocabulary)}"
-    if len(left) > MAX_HOLES:
-        yield f"hole: '{state}' has {len(left) - MAX_HOLES} more"
+    if len(uncovered) > MAX_HOLES:
+        yield f"hole: '{state}' has {len(uncovered) - MAX_HOLES} more"
 
 
-def without(box: Box, taken: Box) -> Sequence[Box]:
-    """Return disjoint boxes that hold the cases of `box` that are not in `taken`; both name the
-    same conditions.
+def without(box: Box, removed: Box) -> Sequence[Box]:
+    """Return the cases of `box` that are not in `removed`, as disjoint boxes.
+
+    Both boxes must have the same conditions.
     """
     pieces = []
     rest = dict(box)
-    for condition, values in taken.items():
+    for condition, values in removed.items():
         outside = rest[condition] - values
         inside = rest[condition] & values
         if not inside:
@@ -163,21 +174,24 @@ def without(box: Box, taken: Box) -> Sequence[Box]:
 
 
 def joined(boxes: Sequence[Box]) -> list[Box]:
-    """Return fewer boxes with the same cases: two that differ in one condition become one."""
-    left = [*boxes]
-    while pair := next((p for p in combinations(left, 2) if _differ_once(*p)), None):
-        one, other = pair
-        left[left.index(one)] = {name: one[name] | other[name] for name in one}
-        left.remove(other)
-    return left
+    """Return the same cases in fewer boxes.
+
+    Two boxes that differ in a single condition are merged until no such pair is left.
+    """
+    merged = [*boxes]
+    while pair := next((p for p in combinations(merged, 2) if _differ_once(*p)), None):
+        first, second = pair
+        merged[merged.index(first)] = {name: first[name] | second[name] for name in first}
+        merged.remove(second)
+    return merged
 
 
-def _differ_once(one: Box, other: Box) -> bool:
-    return sum(one[name] != other[name] for name in one) == 1
+def _differ_once(first: Box, second: Box) -> bool:
+    return sum(first[name] != second[name] for name in first) == 1
 
 
 def _described(box: Box, vocabulary: Vocabulary) -> str:
-    """Return the cases of a box as text, without the conditions that may have any value."""
+    """Format the cases of a box, without conditions that may have any value."""
     narrow = {n: values for n, values in box.items() if len(values) < len(vocabulary.conditions[n])}
     return _listed(narrow)
 

@@ -1,8 +1,8 @@
-"""The elemental move level as a state table: pick and place by poses taught relative to an object
-or a place.
+"""The elemental move level as a state table.
 
-The plan is static: heights above what is to be reached, at a speed each. The executor computes the
-joints of a pose when a row says `move`, from the object's place as sensed, in bounded time.
+It picks and places with taught poses relative to an object or a place. The plan is static: each
+pose has a height above the object or place, and a speed. When a row says `move`, the executor
+computes joint positions from the sensed pose of the object, in bounded time.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ from rack.levels.tables import Finite, NotNegative, Positive, SceneConfig, Table
 
 DOWN = (0.0, 0.0, -1.0)
 HOME = "home"
-"""The pose in which the arm starts."""
+"""Name of the pose in which the arm starts."""
 STILL_M_S = 0.005
-"""An object slower than this rests."""
+"""An object slower than this is at rest."""
 
 
 class MoveTableStatus(TableStatus, version=1):
@@ -50,12 +50,12 @@ class MoveTableStatus(TableStatus, version=1):
 
 
 class TaughtPoseConfig(Table):
-    """`[plan.pose.<name>]`: a pose of the tool, pointing down, relative to an object or a place."""
+    """`[plan.pose.<name>]`: pose of the tool, pointing down, relative to an object or a place."""
 
     height: Finite
-    """of the tool above its origin, m"""
+    """height of the tool above the origin of the object or place, m"""
     speed: Positive = Key(1.0, le=1.0)
-    """part of the joints' limits on the way there"""
+    """fraction of the joints' limits on the way to the pose"""
 
 
 class MovePlanConfig(Table):
@@ -64,15 +64,15 @@ class MovePlanConfig(Table):
     pose: dict[Name, TaughtPoseConfig] = Key(min_length=1)
     """poses by name"""
     place: dict[Name, Place] = {}
-    """origin of an object put there, m, by name"""
+    """origin of an object after it was put at the place, m, by name"""
     moved: NotNegative = 0.01
-    """distance from where it was sensed , or should stand, at which an object is displaced, m"""
+    """distance from its sensed or intended position beyond which an object is displaced, m"""
     home_speed: Positive = Key(1.0, le=1.0)
-    """part of the joints' limits on the way home"""
+    """fraction of the joints' limits on the way home"""
 
 
 class MoveTable(StateTableExecutor):
-    """Picks an object, puts it down at a place, goes home, pose by pose as its table says."""
+    """Executor that picks objects, puts them at places and moves home, pose by pose."""
 
     above = Inputs(TableCommand, "above.command", optional=True)
     below = Input(JointMoveStatus, "below.status")
@@ -87,10 +87,10 @@ class MoveTable(StateTableExecutor):
             "below": BELOW,
             # Whether the objects are sensed.
             "world": ("seen", "unseen"),
-            # The object to pick: there: where it was sensed for the newest `move`; a place is
-            # always there.
+            # The object to pick is there while it rests where it was sensed for the newest `move`.
+            # For a place it is always `there`.
             "target": ("there", "displaced", "moving"),
-            # Where the object put down last rests: at its place, or not.
+            # Whether the object put down last rests at its place.
             "support": ("there", "elsewhere"),
             # Whether the gripper holds something.
             "gripper": ("free", "holds"),
@@ -99,41 +99,41 @@ class MoveTable(StateTableExecutor):
         },
         commands={
             "pick": ("object",),
-            # What the gripper holds, at a place.
+            # Put the held object at a place.
             "place": ("place",),
             HOME: (),
         },
         actions={
-            # To a pose, relative to the object or place of the command in force.
+            # Go to a pose relative to the object or place of the command in force.
             "move": ("pose",),
             "open": (),
             "close": (),
         },
         plan=MovePlanConfig,
     )
+    # Both as read in this cycle.
     _below: JointMoveStatus
     _world: WorldState
-    """As of this cycle."""
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         self._cell = cell_of(context)
         self._ik = InverseKinematics(self._cell, context.seed)
-        # The newest command sent down: it aims at a place, unless `object` is a row.
+        # Newest command sent down. It aims at a place if `object` is -1.
         self._command = JointMove.zeros(context.sizes)
         self._command.joints = self._cell.home
         self._command.speed = 1.0
         self._command.object = -1
         self._reached = True
-        self._put = -1  # row of the object put down last; -1: none
+        self._put = -1  # row of the object put down last, -1 if there is none
 
     @classmethod
     def lexicon(cls, scene: SceneConfig, plan: Any) -> Lexicon:
-        """Return objects, places and poses."""
+        """Return the names of the objects, places and poses."""
         return {"object": scene.objects, "place": tuple(plan.place), "pose": (*plan.pose, HOME)}
 
     def recall(self) -> None:
-        """Continue with the command sent down last."""
+        """Continue with the command that was sent down last."""
         super().recall()
         if self.last_status.is_there and self.last_command.is_there:
             last = self.last_status.message
@@ -143,7 +143,7 @@ class MoveTable(StateTableExecutor):
             self._put = last.put
 
     def look(self, tick: int) -> dict[str, str]:
-        """Return where the level below, the object and the gripper are."""
+        """Return the conditions of the level below, the objects and the gripper."""
         self._below = self.below.message
         self._world = self.world.message
         self.detail = self._below.reason
@@ -164,6 +164,7 @@ class MoveTable(StateTableExecutor):
         }
 
     def _target(self, row: int) -> str:
+        """Return the value of the condition `target` for an object's row; -1 means a place."""
         if row < 0:
             return "there"
         if norm(self._world.velocity[row]) > STILL_M_S:
@@ -171,12 +172,12 @@ class MoveTable(StateTableExecutor):
         return "there" if self._is_at(row) else "displaced"
 
     def _is_at(self, row: int) -> bool:
-        """Return whether an object is where the newest motion aims."""
+        """Return True if an object is where the newest motion aims."""
         distance = norm(self._world.position[row] - self._command.aim)
         return bool(distance <= self.table.plan.moved)
 
     def do_move(self, pose: str) -> None:
-        """Send the arm to a pose."""
+        """Send the arm to a taught pose, or home."""
         if pose == HOME:
             self._send("move", self._cell.home, self.table.plan.home_speed)
             self._command.object = -1
@@ -198,8 +199,13 @@ class MoveTable(StateTableExecutor):
         self._send("close", self._command.joints, 1.0)
 
     def _tool_at(self, height: float) -> Pose | None:
-        """Return the pose of the tool, pointing down, at a height above the object or place of the
-        command; None: a command without either, or none, is in force.
+        """Return the goal of the tool for the command in force, with the tool pointing down.
+
+        Args:
+            height: Height above the object or place of the command, m.
+
+        Returns:
+            The goal. None if the command names neither object nor place, or if none is in force.
         """
         if len(self.words) < 2:
             return None
@@ -211,37 +217,41 @@ class MoveTable(StateTableExecutor):
             command.yaw = 0.0
         else:
             row = command.object = self.context.scene.objects.index(name)
-            # In the gripper it moves with the arm: it is raised from where it was.
+            # A held object moves with the arm, so the aim stays at its position before the grasp.
             if not self._below.held:
                 command.aim = self._world.position[row]
                 command.yaw = yaw_of(self._world.quaternion[row])
-        now = self._ik.tool_at(command.joints)
-        # Across the object's faces, whichever quarter turn is nearest to the tool now.
+        tool_now = self._ik.tool_at(command.joints)
+        # The gripper must be aligned with the object's faces. Of the four possible turns, take the
+        # one nearest to the present orientation.
         turns = [pointing(DOWN, -(command.yaw + quarter * 0.5 * math.pi)) for quarter in range(4)]
         goals = [Pose(command.aim, turn).raised(height) for turn in turns]
-        return min(goals, key=now.angle_to)
+        return min(goals, key=tool_now.angle_to)
 
     def _solve(self, goal: Pose) -> Array | None:
-        """Return joint positions, rad, at a pose: on the branch of the arm, else from home; at most
-        three descents.
+        """Return joint positions that reach a pose, rad. None if none are found.
+
+        The branch of the arm's present configuration is preferred. At most three descents are
+        tried.
         """
         joints = self._ik.nearby(goal, self._command.joints)
         if joints is None:
             joints = self._ik.reach(goal, self._cell.home)
         return joints if joints is not None else self._ik.reach(goal, self._command.joints)
 
-    def _send(self, what: str, joints: Array, speed: float) -> None:
+    def _send(self, words: str, joints: Array, speed: float) -> None:
+        """Change the command for the level below and give it a new serial."""
         self._command.id += 1
-        self._command.words = what
+        self._command.words = words
         self._command.speed = speed
         self._command.joints = joints
 
     def give(self, tick: int) -> None:
-        """Write the command, and what a restarted board needs."""
-        shown = self.status
+        """Write the command, and the status fields that a restarted board needs."""
+        status = self.status
         self._command.hold = self.holds
         self.command.copy_from(self._command)
-        shown.sent = self._command.id
-        shown.reached = self._reached
-        shown.resting = self.resting
-        shown.put = self._put
+        status.sent = self._command.id
+        status.reached = self._reached
+        status.resting = self.resting
+        status.put = self._put

@@ -1,8 +1,8 @@
-"""A level whose executor is a state table: preprocess (read), decide (the table), postprocess
-(write).
+"""A level whose executor is a state table.
 
-Plans are static: the file of a table names taught poses or steps, and no planner runs. The tables
-of a level are read when its board starts, never in a cycle; an operator swaps between them at a
+A cycle preprocesses its inputs (read), decides by the table, and postprocesses (write). Plans are
+static: the file of a table contains taught poses or steps, and no planner runs. The tables of a
+level are read when its board starts, never in a cycle. An operator can switch between them at a
 tick. To try an edited file, restart the board: `rack inject RACK BOARD kill`.
 """
 
@@ -55,7 +55,7 @@ from rack.levels.tables import SceneConfig, Table, read_params
 
 
 class TableCommand(RelayedCommand, version=1, message="word_command"):
-    """First fields of every command to a level of this kind."""
+    """Fields with which every command to a level of this kind begins."""
 
     hold: bool = field(doc="1: come to rest and stay, whatever is under way")
     words: str = field(
@@ -64,8 +64,9 @@ class TableCommand(RelayedCommand, version=1, message="word_command"):
 
 
 class TableStatus(AnsweringStatus, version=1):
-    """First fields of the status of every level of this kind: with them a restarted board goes
-    on.
+    """Fields with which the status of every level of this kind begins.
+
+    A restarted board continues from them.
     """
 
     table: str = field(f"S{NAME_BYTES}", doc="state table in force")
@@ -82,10 +83,12 @@ class TableStatus(AnsweringStatus, version=1):
 
 YES_NO = ("no", "yes")
 UNKNOWN = "unknown"
-"""A command whose words the level does not know."""
+"""Value of the condition `command` for a command that the level does not know."""
 BELOW = ("waiting", "executing", "done", "error", "lost")
-"""Condition of the level below: waiting: it has not answered the newest command; lost: its board
-is."""
+"""Values of the condition `below`, the answer of the level below.
+
+It is waiting until it has answered the newest command, and lost if its board is lost.
+"""
 
 
 class StateTableParams(Table):
@@ -101,32 +104,41 @@ def vocabulary(
     commands: Phrases | None = None,
     plan: type[Table] = Table,
 ) -> Vocabulary:
-    """Return the vocabulary of a level: its own words and, if it accepts commands, those that come
-    with them.
+    """Build the vocabulary of a level.
+
+    Args:
+        conditions: Possible values of each of the level's own conditions.
+        actions: The level's own actions.
+        commands: Commands that the level accepts. With commands, the conditions `command` and `new`
+            and the action `take` are added. None if it accepts none.
+        plan: Record class of the static plan.
     """
-    known = {**conditions, LATE: YES_NO}
+    all_conditions = {**conditions, LATE: YES_NO}
     if not commands:
-        return Vocabulary(known, {}, actions, plan)
-    # The newest command, of an operator or the level above; whether no row has taken it yet.
-    known |= {"command": ("none", UNKNOWN, *commands), "new": YES_NO}
-    return Vocabulary(known, commands, {**actions, TAKE: ()}, plan)
+        return Vocabulary(all_conditions, {}, actions, plan)
+    # `command` is the newest command, from an operator or the level above. `new` tells whether it
+    # still has to be taken by a row.
+    all_conditions |= {"command": ("none", UNKNOWN, *commands), "new": YES_NO}
+    return Vocabulary(all_conditions, commands, {**actions, TAKE: ()}, plan)
 
 
 class WordCommand(NamedTuple):
-    """A command to the level, of an operator or of the level above."""
+    """A command to the level, from an operator or from the level above."""
 
     is_operators: bool
-    serial: int  # 0: none
+    serial: int  # 0 if there is no command
     words: str
 
 
 OPERATIONS: Commands = {**HOLDABLE, Operation.TABLE: ()}
-"""An operator's commands to every level of this kind."""
+"""Operator commands that every level of this kind obeys."""
 
 
 class StateTableExecutor(Executor):
-    """Base of the levels: a class declares its `vocabulary`, and has `look`, and `do_<action>` for
-    each action.
+    """Base class of levels that are programmed by a state table.
+
+    A subclass declares its `vocabulary` and implements `evaluate_conditions`, and `do_<action>` for
+    each of its actions.
     """
 
     commands: ClassVar[Commands] = {**OPERATIONS, Operation.DO: ()}
@@ -135,7 +147,7 @@ class StateTableExecutor(Executor):
     operator = Input(OperatorCommand, "own.operator")
     status = Output(TableStatus)
     command: RelayedCommand
-    """What it tells the level below, if there is one."""
+    """Command to the level below, if there is one."""
     params = StateTableParams
     vocabulary: ClassVar[Vocabulary]
 
@@ -143,49 +155,56 @@ class StateTableExecutor(Executor):
         super().__init__(context)
         params = read_params(StateTableParams, context.params)
         self.tables = {name: self.read(path, context.scene) for name, path in params.tables.items()}
-        if found := [f"{name}: {why}" for name, why in self._unlike(self.tables, context.scene)]:
-            raise TableError(found)
+        if flaws := [f"{name}: {flaw}" for name, flaw in self._unlike(self.tables, context.scene)]:
+            raise TableError(flaws)
         self.state = ""  # of the table
-        self._since: int | None = None  # tick at which it began; None: in this cycle
+        # Tick at which the state began. None if it begins in this cycle.
+        self._since: int | None = None
         self.use(next(iter(self.tables)))
         self.orders = Orders(self.commands)
-        self.detail = ""  # why, from below: added to the reason of a row
-        self.resting = True  # nothing moves on this level's behalf
+        self.detail = ""  # reason given by the level below, appended to a row's reason
+        self.resting = True  # no motion commanded by this level is under way
         self._newest = WordCommand(False, 0, "")
-        self._taken = self._newest  # the one in force
-        self._done = 0  # newest command of the level above that is done
-        self._kept = ""  # why this level, or the one above, is held; empty: it is not
-        # Newest command of an operator that the last status before a restart had answered.
+        self._taken = self._newest  # command in force
+        self._done = 0  # newest completed command of the level above
+        self._kept = ""  # why this level, or the one above, is held; empty if it is not
+        # Newest operator command that was answered before the board was restarted.
         self._recalled = 0
         self._started = False
 
     @classmethod
     def read(cls, path: Path, scene: SceneConfig) -> StateTable:
-        """Return the table in a file. Raises `TableError` with every mistake in it."""
+        """Read and check the table in a file. Raises `TableError` with every mistake in it."""
         table = read_table(path, cls.vocabulary)
         lexicon = None if table.plan is None else cls.lexicon(scene, table.plan)
-        found = flaws(table, cls.vocabulary, lexicon)
+        lines = flaws(table, cls.vocabulary, lexicon)
         if table.plan is not None:
-            found += cls.plan_flaws(scene, table.plan)
-        if found:
-            raise TableError(found)
+            lines += cls.plan_flaws(scene, table.plan)
+        if lines:
+            raise TableError(lines)
         return table
 
     @classmethod
     def lexicon(cls, scene: SceneConfig, plan: Any) -> Lexicon:
-        """Return the sets of words that depend on the scene, and on a table's plan, by name."""
+        """Return the sets of words that depend on the scene and on a table's plan, by name."""
         return {"object": scene.objects}
 
     @classmethod
     def plan_flaws(cls, scene: SceneConfig, plan: Any) -> list[str]:
-        """Return what does not suit the scene in a plan, a line each."""
+        """Return one line for every entry of a plan that does not suit the scene."""
         return []
 
     @classmethod
     def misfits(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Misfits:
-        """Yield every mistake in every table, and commands that one of them does not know."""
+        """Yield every mistake in every table, and commands that one of the tables does not know.
+
+        Args:
+            context: Context of this level.
+            above: Contexts of the levels above, unused.
+            below: Contexts of the levels below, unused.
+        """
         files = read_params(StateTableParams, context.params).tables
         tables = {}
         for name, path in files.items():
@@ -201,18 +220,19 @@ class StateTableExecutor(Executor):
     def _unlike(
         cls, tables: Mapping[str, StateTable], scene: SceneConfig
     ) -> Iterator[tuple[str, str]]:
-        """Yield tables that do not know a command that another one does, and why: the one in force
-        outlives a swap.
+        """Yield the name of each table that lacks a command of another one, and the reason.
+
+        All tables must know the same commands, because the command in force survives a switch.
         """
-        known = {name: cls._known(scene, table) for name, table in tables.items()}
-        for name, mine in known.items():
-            lacking = {
+        commands = {name: cls._known(scene, table) for name, table in tables.items()}
+        for name, own_commands in commands.items():
+            missing = {
                 phrase: other
-                for other, theirs in known.items()
-                for phrase in theirs
-                if phrase not in mine
+                for other, other_commands in commands.items()
+                for phrase in other_commands
+                if phrase not in own_commands
             }
-            for phrase, other in lacking.items():
+            for phrase, other in missing.items():
                 yield (
                     name,
                     f"does not know '{phrase}', as '{other}' does; all tables of a level know the"
@@ -221,21 +241,34 @@ class StateTableExecutor(Executor):
 
     @classmethod
     def _known(cls, scene: SceneConfig, table: StateTable) -> Sequence[str]:
+        """Return every command that a table accepts, with its parameters."""
         return tuple(phrases(cls.vocabulary.commands, cls.lexicon(scene, table.plan)))
 
     @classmethod
     def wording(
         cls, what: Operation, params: Mapping[str, Any], scene: SceneConfig
     ) -> Sequence[str]:
-        """Return the names of the tables, or the commands that the first one's plan permits."""
+        """Return the words that an operator may give with an operation.
+
+        Args:
+            what: Operation to complete.
+            params: Parameters of the level, which name its tables.
+            scene: Scene of the rack.
+
+        Returns:
+            Names of the tables for `Operation.TABLE`. Otherwise the commands that the plan of the
+            first table permits.
+        """
         tables = read_params(StateTableParams, params).tables
         if what is Operation.TABLE:
             return tuple(tables)
         return cls._known(scene, cls.read(next(iter(tables.values())), scene))
 
     def use(self, name: str) -> None:
-        """Put a table in force. It goes on in the state of the same name; without one, in the state
-        it starts in.
+        """Switch to a table.
+
+        The level continues in the state of the same name if the table has one, else in the start
+        state.
         """
         self.table_name = name
         self.table = self.tables[name]
@@ -244,7 +277,7 @@ class StateTableExecutor(Executor):
             self._since = None
 
     def process(self, tick: int) -> None:
-        """Do one cycle: read, let one row fire, write."""
+        """Run one cycle: read, let one row fire, write."""
         if not self._started:
             self._started = True
             self.recall()
@@ -253,7 +286,8 @@ class StateTableExecutor(Executor):
         self._since = tick if self._since is None else self._since
         values[LATE] = YES_NO[(tick - self._since) * self.context.tick_s > self.table.patience_s]
         if self.vocabulary.commands:
-            # Without the words: of one command they differ only where an edited table knows others.
+            # Compare without the words. They differ for one command only if an edited table knows
+            # other commands.
             is_new = self._newest[:2] != self._taken[:2] and self._newest.serial > 0
             command = self._newest if is_new else self._taken
             values["command"] = command.words.partition(" ")[0] or "none"
@@ -273,39 +307,36 @@ class StateTableExecutor(Executor):
         """Return the value of each of the level's own conditions in this cycle."""
 
     def give(self, tick: int) -> None:
-        """Fill what the level writes, other than the fields of `TableStatus`."""
+        """Write the outputs of the level, except the fields of `TableStatus`."""
 
     def do_take(self) -> None:
-        """Let the newest command be the one in force."""
+        """Bring the newest command into force."""
         self._taken = self._newest
 
     @property
     def words(self) -> list[str]:
-        """The command in force, or the newest one if it was just taken, word by word."""
+        """Words of the command in force."""
         return self._taken.words.split()
 
     @property
     def holds(self) -> bool:
-        """Whether an operator, or the level above, holds this one; or its board is lost."""
+        """Whether the level is held, by an operator, the level above, or the loss of that board."""
         return bool(self._kept)
 
     def recall(self) -> None:
-        """Continue from the last messages in the level's own mailboxes, after a restart of its
-        board.
-        """
+        """Continue from the level's own last messages after a restart of its board."""
         if not self.last_status.is_there:
             return
         last = self.last_status.message
         self.status.copy_from(last)
         self.state = last.in_state
-        table = last.table if last.table in self.tables else self.table_name
-        self.use(table)
+        self.use(last.table if last.table in self.tables else self.table_name)
         self._recalled = answered(last)
         self._done = last.done
         self._taken = WordCommand(last.ordered > 0, last.ordered or last.echo, last.words)
 
     def _preprocess(self) -> None:
-        """Take up what the operator and the level above command."""
+        """Take the commands of the operator and of the level above."""
         orders = self.orders
         orders.take(self.operator, self._judge)
         self._kept = ""
@@ -321,7 +352,7 @@ class StateTableExecutor(Executor):
             self._kept = orders.keeps(self.context.board)
 
     def _hear(self, above: Reading[TableCommand]) -> None:
-        """Take up what the level above commands, unless an operator commands instead."""
+        """Take the command of the level above, unless an operator commands the level."""
         command = above.message
         self._rests_on = self.orders.rests_on(command.operator)
         if self.orders.standing is Operation.DO:
@@ -337,12 +368,12 @@ class StateTableExecutor(Executor):
             self._kept = HELD_FROM_ABOVE
 
     def _objection(self, words: str) -> str:
-        """Return why the level does not know a command; empty: it does."""
+        """Return why the level does not know a command. Empty if it knows it."""
         lexicon = self.lexicon(self.context.scene, self.table.plan)
         return objection(words, self.vocabulary.commands, lexicon)
 
     def _judge(self, order: OperatorCommand) -> None:
-        """Take up an operator's command for this kind of level."""
+        """Carry out or refuse an operator's command that is specific to this kind of level."""
         if order.what == Operation.TABLE:
             if order.name not in self.tables:
                 self.orders.refuse(f"no table '{order.name}'; tables: {', '.join(self.tables)}")
@@ -355,8 +386,13 @@ class StateTableExecutor(Executor):
                 self._newest = WordCommand(True, order.id, order.name)
 
     def _report(self, number: int, row: RowConfig) -> None:
-        """Fill the fields of `TableStatus`, and the operator's in the command."""
-        shown = self.status
+        """Fill the fields of `TableStatus` and, in the command below, the operator's serial.
+
+        Args:
+            number: Number of the row that fired.
+            row: The row that fired.
+        """
+        status = self.status
         orders = self.orders
         state = STATES[row.status]
         reason = row.reason
@@ -365,27 +401,28 @@ class StateTableExecutor(Executor):
             reason = self._kept
         elif reason and self.detail:
             reason = f"{reason}: {self.detail}"
-        if row.next == SAME and state is State.ERROR and shown.state == state:
-            reason = shown.reason  # the first one, from below too: the row only stays with it
+        if row.next == SAME and state is State.ERROR and status.state == state:
+            # A row that stays in an error keeps the first reason, with its detail from below.
+            reason = status.reason
         is_operators, serial, words = self._taken
-        shown.ordered = 0
+        status.ordered = 0
         if is_operators:
-            shown.ordered = serial
-            shown.echo = 0 if orders.standing is Operation.DO else self._done
+            status.ordered = serial
+            status.echo = 0 if orders.standing is Operation.DO else self._done
         else:
-            shown.echo = serial
+            status.echo = serial
             if state is State.DONE:
                 self._done = serial
-        shown.state = state
-        shown.error = Error.TABLE if state is State.ERROR else Error.NONE
-        shown.reason = reason
-        shown.table = self.table_name
-        shown.checksum = self.table.checksum
-        shown.in_state = self.state
-        shown.row = number
-        shown.fired = row.name
-        shown.words = words
-        shown.done = self._done
+        status.state = state
+        status.error = Error.TABLE if state is State.ERROR else Error.NONE
+        status.reason = reason
+        status.table = self.table_name
+        status.checksum = self.table.checksum
+        status.in_state = self.state
+        status.row = number
+        status.fired = row.name
+        status.words = words
+        status.done = self._done
         is_done = self.resting if orders.holds else state is State.DONE
         if is_operators and serial == orders.in_force and state is State.ERROR:
             orders.fail(reason)
@@ -393,11 +430,16 @@ class StateTableExecutor(Executor):
             orders.done()
         if "command" in self.outputs:
             self.command.operator = self._rests_on
-        orders.report(shown, self._rests_on)
+        orders.report(status, self._rests_on)
 
 
 def answer_of(reading: Reading[TableStatus], serial: int) -> str:
-    """Return the value of `BELOW` for a status and the serial of the newest command sent down."""
+    """Return the value of the condition `below`, one of `BELOW`.
+
+    Args:
+        reading: Status of the level below.
+        serial: Serial of the newest command sent down.
+    """
     if reading.is_lost:
         return "lost"
     if not reading.is_there or reading.message.echo != serial or not serial:

@@ -1,8 +1,7 @@
-"""The primitive level as a state table: straight motions in joint space from rest to rest, and the
-gripper.
+"""The primitive level as a state table.
 
-A motion is a smooth stream of set points for the boards that servo the joints, two cycles ahead of
-the arm.
+It moves the joints straight from rest to rest and works the gripper. A motion is a smooth stream of
+set points for the boards that servo the joints, two cycles ahead of the arm.
 """
 
 from __future__ import annotations
@@ -31,22 +30,27 @@ from rack.levels.systems.state_table.level import (
 from rack.levels.tables import Positive, Table
 
 LEAD_CYCLES = 2
-"""Cycles from the release that makes a set point to the tick at which it is due: one brings it
-down, the boards below interpolate to it over the second."""
+"""Cycles from the release that computes a set point to the tick at which it is due.
+
+The first cycle transports the set point, and during the second the boards below interpolate to it.
+"""
 HANDOVER_CYCLES = 4
-"""Cycles from the first set point until the boards below must follow."""
+"""Cycles after the first set point within which the boards below must follow."""
 NOWHERE_RAD = 1e-9
-"""A motion shorter than this is none."""
+"""A motion shorter than this is not started."""
 MIN_SPEED = 0.01
 GRIP_CYCLES = 6
-"""Cycles for which the gripper counts as moving after a command, until its motion shows."""
+"""Cycles after a command for which the gripper counts as moving, until its motion shows."""
 GRIP_STILL_M_S = 0.002
 GRIP_MARGIN_M = 0.001
-"""A gripper this near to open or closed is; closed in between it holds something."""
+"""Distance from its open or closed position within which the gripper has reached it.
+
+If it stops in between while closing, it holds something.
+"""
 
 
 class JointMove(TableCommand, version=1):
-    """From the elemental move level of state tables to its primitive level."""
+    """Command from the elemental move level of state tables to its primitive level."""
 
     joints: np.ndarray = per_joint("rad", "where a motion ends")
     speed: float = field(unit="1", doc="part of the joints' limits")
@@ -72,11 +76,11 @@ class PrimitivePlanConfig(Table):
     """`[plan]` of the primitive level's table."""
 
     settled: Positive = 0.01
-    """distance from its end at which a joint has arrived, rad"""
+    """distance from its end position within which a joint has arrived, rad"""
 
 
 class PrimitiveTable(StateTableExecutor):
-    """Moves the joints along straight lines and works the gripper, as its table says."""
+    """Executor that moves the joints along straight lines and works the gripper."""
 
     above = Inputs(JointMove, "above.command", optional=True)
     statuses = Inputs(JointStatus, "below.status")
@@ -92,13 +96,13 @@ class PrimitiveTable(StateTableExecutor):
         conditions={
             # Whether an operator or the level above holds this one, or its board is lost.
             "hold": YES_NO,
-            # Arrived: at rest where the newest motion ends; resting: elsewhere; away: the joints do
-            # not follow.
+            # `arrived` and `resting` both mean at rest: at the end of the newest motion, or
+            # elsewhere. `away` means that the joints do not follow.
             "arm": ("arrived", "resting", "moving", "away"),
-            # Empty: closed on nothing.
+            # `empty` means that the gripper has closed on nothing.
             "gripper": ("moving", "open", "empty", "holds"),
         },
-        # Move the joints straight to the command's; work the gripper.
+        # Move the joints straight to the commanded positions; work the gripper.
         commands={"move": (), "open": (), "close": ()},
         actions={"begin": (), "halt": (), "open": (), "close": ()},
         plan=PrimitivePlanConfig,
@@ -115,12 +119,12 @@ class PrimitiveTable(StateTableExecutor):
         self._masses = cell.model.body_subtreemass[cell.bodies].copy()  # kg
         self._point = np.zeros((3, len(cell.home)))  # the newest set point: rad, rad/s, rad/s2
         self._point[0] = cell.home
-        self._goal = cell.home.copy()  # (joints,), rad: of the newest command
-        self._speed = 1.0  # part of the limits: likewise
+        self._goal = cell.home.copy()  # (joints,), rad: goal of the newest command
+        self._speed = 1.0  # its speed, a fraction of the limits
         self._end = cell.home.copy()  # (joints,), rad: where the newest motion ends
-        self._curve: Curve | None = None  # None: at rest
-        self._from = 0  # tick at which it began
-        self._follows = 0  # cycles for which the boards below have followed; 0: they do not
+        self._curve: Curve | None = None  # None at rest
+        self._from = 0  # tick at which the curve began
+        self._follows = 0  # cycles for which the boards below have followed, 0 if they do not
         self._closed = False
         self._held = False
         self._object = -1
@@ -129,8 +133,9 @@ class PrimitiveTable(StateTableExecutor):
         self._grips = 0  # cycles until the gripper's motion must show
 
     def recall(self) -> None:
-        """Continue with the gripper as it is; the arm's motion begins anew from where the boards
-        below hold it.
+        """Continue with the gripper as it is.
+
+        The motion of the arm starts again from where the boards below hold it.
         """
         super().recall()
         if self.last_status.is_there:
@@ -143,7 +148,7 @@ class PrimitiveTable(StateTableExecutor):
             self.command.copy_from(self.last_command.message)
 
     def look(self, tick: int) -> dict[str, str]:
-        """Return whether the arm follows and has arrived, and what the gripper does."""
+        """Return whether the arm follows and has arrived, and the state of the gripper."""
         for reading in self.above.values():
             self._goal = reading.message.joints
             self._speed = reading.message.speed
@@ -154,14 +159,14 @@ class PrimitiveTable(StateTableExecutor):
             self._point[0] = self._curve.table[curves.REST]
             self._point[1:] = 0.0
             self._curve = None
-        away = np.abs(position - self._point[0]).max() > self.table.plan.settled
-        self.resting = self._curve is None and not away
-        there = np.abs(self._end - self._point[0]).max() <= self.table.plan.settled
+        is_away = np.abs(position - self._point[0]).max() > self.table.plan.settled
+        self.resting = self._curve is None and not is_away
+        is_at_end = np.abs(self._end - self._point[0]).max() <= self.table.plan.settled
         arm = "away"
         if self._follows and not self.resting:
             arm = "moving"
         elif self._follows:
-            arm = "arrived" if there else "resting"
+            arm = "arrived" if is_at_end else "resting"
         return {
             "arm": arm,
             "gripper": self._grip(self.arm.message),
@@ -169,21 +174,21 @@ class PrimitiveTable(StateTableExecutor):
         }
 
     def _follow(self) -> Array:
-        """Find out whether the boards below follow; return the joint positions, rad."""
+        """Update whether the boards below follow, and return the joint positions, rad."""
         readings = list(self.statuses.values())
         statuses = [reading.message for reading in readings]
         position: Array = statuses[0].position
-        gone = any(reading.is_lost or not reading.is_there for reading in readings)
-        stopped = gone or any(below.stopped for below in statuses)
+        is_lost = any(reading.is_lost or not reading.is_there for reading in readings)
+        has_stopped = is_lost or any(below.stopped for below in statuses)
         self.detail = next((below.reason for below in statuses if below.reason), "")
-        if gone:
+        if is_lost:
             self.detail = "its board is lost"
-        idle = any(below.holding for below in statuses) and self._follows > HANDOVER_CYCLES
-        if stopped or idle:
+        has_left = any(below.holding for below in statuses) and self._follows > HANDOVER_CYCLES
+        if has_stopped or has_left:
             self._follows = 0
-        if not stopped:
+        if not has_stopped:
             if not self._follows:
-                # From where the arm is, at rest.
+                # Start from the arm's position, at rest.
                 self._point[0] = position
                 self._point[1:] = 0.0
                 self._curve = None
@@ -204,8 +209,9 @@ class PrimitiveTable(StateTableExecutor):
         return "holds" if self._held else "empty"
 
     def do_begin(self) -> None:
-        """Begin the motion to the joints of the command in force, from rest; while the arm moves,
-        halt.
+        """Start the motion to the joints of the command in force.
+
+        A motion must start at rest, therefore a moving arm is halted first.
         """
         if self._curve is not None:
             self.do_halt()
@@ -219,18 +225,18 @@ class PrimitiveTable(StateTableExecutor):
             self._start(Passage(start, goal, speed * limits.velocity, speed * limits.acceleration))
 
     def do_halt(self) -> None:
-        """Ramp to rest."""
+        """Ramp the joints to rest."""
         if self._curve is not None:
             self._start(Ramp(self._point[0], self._point[1], self._limits.acceleration))
 
     def _start(self, curve: Curve) -> None:
-        """Begin a curve where the set point before this cycle's ends."""
+        """Start a curve at the set point of the previous cycle."""
         self._curve = curve
         self._from = self._due - self.context.every
 
     @property
     def _passed_s(self) -> float:
-        """Time since the curve began at which the set point of this cycle is due."""
+        """Time from the start of the curve to the due tick of this cycle's set point, s."""
         return (self._due - self._from) * self.context.tick_s
 
     def do_open(self) -> None:
@@ -240,15 +246,15 @@ class PrimitiveTable(StateTableExecutor):
         self._object = -1
 
     def do_close(self) -> None:
-        """Close the gripper."""
+        """Close the gripper on the object of the newest command."""
         self._closed = True
         self._grips = GRIP_CYCLES
         self._object = self._target
 
     def give(self, tick: int) -> None:
-        """Write the set point, with inertia and load there, and what a restarted board needs."""
+        """Write the set point with its inertia and load, and what a restarted board needs."""
         command = self.command
-        shown = self.status
+        status = self.status
         if self._curve is not None:
             self._point[:] = self._curve.at(self._passed_s).table
         command.id = tick // self.context.every + 1
@@ -264,9 +270,9 @@ class PrimitiveTable(StateTableExecutor):
         command.opening = self._gripper.closed if self._closed else self._gripper.open
         command.force = self._gripper.force
         command.payload_mass = mass
-        shown.position = self._point[0]
-        shown.end = self._end
-        shown.moving = not self.resting
-        shown.closed = self._closed
-        shown.held = self._held
-        shown.object = self._object if self._held else -1
+        status.position = self._point[0]
+        status.end = self._end
+        status.moving = not self.resting
+        status.closed = self._closed
+        status.held = self._held
+        status.object = self._object if self._held else -1

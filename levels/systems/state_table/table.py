@@ -16,14 +16,14 @@ words is finite, so whether two rows overlap, and which case no row takes, can b
     [[row]]
     name = "nothing to do"
     state = "idle"
-    else = true                             # takes what the rows of the state above this one leave
+    else = true                             # fires when no earlier row of the state does
     ...
 
     [plan]                                  # the static plan, as the level declares it
 
-`next = "same"` stays in the state. In every cycle the first row that matches fires, and no other.
-Rows of a state exclude each other, unless the later one says `else`; together they take every case.
-`rack.levels.systems.state_table.checks` sees to that before the launch.
+`next = "same"` stays in the state. In every cycle only the first matching row fires. The rows of a
+state exclude each other, unless the later one says `else`, and together they cover every case.
+`rack.levels.systems.state_table.checks` verifies this before the launch.
 """
 
 from __future__ import annotations
@@ -45,27 +45,40 @@ from rack.levels.errors import LevelError
 from rack.levels.tables import Positive, Table, Vector
 
 NAME_BYTES = 24
-"""Longest word, name of a state, or name of a table."""
+"""Maximum length of a word, a state's name or a table's name."""
 PHRASE_BYTES = 64
-"""Longest command or action, with its parameters."""
+"""Maximum length of a command or action with its parameters."""
 TAKE = "take"
-"""The action of every level: from now on the newest command is the one in force, and the status
-answers it."""
+"""Action that every level has: the newest command comes into force.
+
+From then on the status answers this command.
+"""
 
 
 Values = tuple[str, ...]
-"""What a condition may be: it always has exactly one of these."""
+"""Possible values of a condition. In every cycle it has exactly one of them."""
 Phrases = Mapping[str, tuple[str | Values, ...]]
-"""Commands that a level accepts, or actions, by their word: one set of words for each word that
-follows it; a name stands for a set of `Lexicon`."""
+"""Accepted commands, or actions, by their first word.
+
+Each parameter that follows the word is a tuple of permitted words, or the name of a set of words in
+`Lexicon`.
+"""
 Lexicon = Mapping[str, Sequence[str]]
-"""Sets of words that depend on scene and plan, by name: "object" -> the objects of the scene."""
+"""Sets of words that depend on the scene and the plan.
+
+For example, "object" names the objects of the scene.
+"""
 
 
 @dataclass(frozen=True)
 class Vocabulary:
-    """All words of one kind of level. `plan` is the record of `[plan]`, the static plan in the file
-    of a table.
+    """All words of one kind of level.
+
+    Attributes:
+        conditions: Possible values of each condition.
+        commands: Commands that the level accepts.
+        actions: Actions that rows may name in `do`.
+        plan: Record class of `[plan]`, the static plan in a table's file.
     """
 
     conditions: Mapping[str, Values]
@@ -75,27 +88,34 @@ class Vocabulary:
 
 
 def phrases(verbs: Phrases, lexicon: Lexicon) -> Iterator[str]:
-    """Yield every command or action with its parameters: "pick block1"."""
+    """Yield every command or action with its parameters, such as "pick block1"."""
     for word, parameters in verbs.items():
-        for given in product(*(_words(parameter, lexicon) for parameter in parameters)):
-            yield " ".join((word, *given))
+        for arguments in product(*(_words(parameter, lexicon) for parameter in parameters)):
+            yield " ".join((word, *arguments))
 
 
 def _words(parameter: str | Values, lexicon: Lexicon) -> Sequence[str]:
+    """Return the permitted words of a parameter, which may be the name of a set."""
     return lexicon[parameter] if isinstance(parameter, str) else parameter
 
 
 def objection(phrase: str, verbs: Phrases, lexicon: Lexicon) -> str:
-    """Return why `phrase` is none of the commands or actions; empty: it is one."""
+    """Return why a phrase is not a valid command or action. Empty if it is valid.
+
+    Args:
+        phrase: Command or action with its parameters.
+        verbs: Commands or actions of the level, by first word.
+        lexicon: Sets of words that depend on the scene and the plan.
+    """
     if len(phrase) > PHRASE_BYTES:
         return f"'{phrase}' has {len(phrase)} characters; permitted: {PHRASE_BYTES}"
-    word, *given = phrase.split() or [""]
+    word, *arguments = phrase.split() or [""]
     if word not in verbs:
         return f"unknown '{word}'; known: {', '.join(verbs) or 'none'}"
-    wanted = verbs[word]
-    if len(given) != len(wanted):
-        return f"'{phrase}' has {len(given)} parameters; '{word}' takes {len(wanted)}"
-    for value, parameter in zip(given, wanted, strict=True):
+    parameters = verbs[word]
+    if len(arguments) != len(parameters):
+        return f"'{phrase}' has {len(arguments)} parameters; '{word}' takes {len(parameters)}"
+    for value, parameter in zip(arguments, parameters, strict=True):
         permitted = _words(parameter, lexicon)
         if value not in permitted:
             return f"'{value}' of '{phrase}' is unknown; known: {', '.join(permitted) or 'none'}"
@@ -112,7 +132,7 @@ Reason = Annotated[str, StringConstraints(pattern=rf"^[ -~]{{1,{REASON_BYTES}}}$
 
 
 def _listed(value: Any) -> Any:
-    """Return one word as a list of one, and TOML's lists as tuples, which are frozen."""
+    """Convert a single word to a tuple of one word, and a list to an immutable tuple."""
     if isinstance(value, str):
         return (value,)
     return tuple(value) if isinstance(value, list) else value
@@ -124,42 +144,42 @@ Place = Annotated[Vector, BeforeValidator(_listed)]
 
 
 SAME = "same"
-"""The `next` of a row that stays in its state."""
+"""Value of `next` in a row that stays in its state."""
 LATE = "late"
-"""The condition that every table may use: whether its state has lasted longer than its
-`patience`."""
+"""Condition of every table: whether its state has lasted longer than its `patience`."""
 
 
 class RowConfig(Table):
     """`[[row]]`: one row of a state table."""
 
     name: RowName
-    """what the row is for: shown while it fires"""
+    """purpose of the row, shown while it fires"""
     state: States = Field(min_length=1)
     """the state, or a list of states, in which it may fire"""
     when: dict[str, Words] = {}
-    """value, or a list of values, by condition"""
+    """required value, or list of accepted values, by condition"""
     otherwise: bool = Field(False, alias="else")
-    """takes what the rows of the state above this one leave"""
-    # Those of the next three that are missing are reported with what else is wrong with the table.
+    """fires in every case that the earlier rows of the state leave"""
+    # The next three keys are required. They have defaults because a missing key is reported
+    # together with all other mistakes of the table.
     next: Name = SAME
     """next state, or same"""
     do: Words = ()
-    """actions with their parameters, in order; may be an empty list"""
+    """actions with their parameters, in order; the list may be empty"""
     status: str = Field("error", description="state shown upwards: " + ", ".join(STATES))
     reason: Reason = ""
     """shown with status error or holding"""
 
     def matches(self, values: Mapping[str, str]) -> bool:
-        """Return whether the row fires on these values of the conditions."""
+        """Return True if the row fires for these values of the conditions."""
         return all(values[condition] in permitted for condition, permitted in self.when.items())
 
 
 class TableConfig(Table):
-    """A state table's file."""
+    """File of a state table."""
 
     start: Name
-    """state in which the table begins"""
+    """initial state"""
     patience: Positive = 10.0
     """time in one state after which the condition late is yes, s"""
     row: tuple[dict[str, Any], ...] = Field(min_length=1, max_length=500)
@@ -169,7 +189,11 @@ class TableConfig(Table):
 
 
 class TableError(LevelError):
-    """A state table that cannot be used. `flaws` holds every mistake, a line each."""
+    """Raised for a state table that cannot be used.
+
+    Attributes:
+        flaws: Every mistake in the table, one line each.
+    """
 
     def __init__(self, flaws: Iterable[str]) -> None:
         self.flaws = tuple(flaws)
@@ -178,21 +202,27 @@ class TableError(LevelError):
 
 @dataclass(frozen=True)
 class StateTable:
-    """A state table as read. `flaws` are the mistakes in the form of the file.
+    """A state table as read from its file.
 
-    `configs` holds the readable rows by number; rows with a mistake in their form are missing.
+    Attributes:
+        start: Initial state.
+        patience_s: Time in one state after which the condition `late` is yes, s.
+        configs: Readable rows by number. Rows with formal mistakes are missing.
+        plan: The level's record of `[plan]`. None if it has mistakes.
+        checksum: CRC-32 of the file.
+        flaws: Formal mistakes of the file, one line each.
     """
 
     start: str
     patience_s: float
     configs: Mapping[int, RowConfig]
-    plan: Any  # the level's record of `[plan]`; None: it has mistakes
-    checksum: int  # CRC-32 of the file
+    plan: Any
+    checksum: int
     flaws: tuple[str, ...]
 
     @cached_property
     def rows(self) -> Mapping[str, Mapping[int, RowConfig]]:
-        """The rows by state and number, each state's in their order."""
+        """The rows by state and number, in file order within each state."""
         rows: dict[str, dict[int, RowConfig]] = {}
         for number, row in self.configs.items():
             for state in row.state:
@@ -200,8 +230,10 @@ class StateTable:
         return rows
 
     def decide(self, state: str, values: Mapping[str, str]) -> tuple[int, RowConfig]:
-        """Return the row that fires, after its number; number 0, an error: no row takes the case,
-        which cannot happen in a table that was checked.
+        """Return the number of the row that fires, and the row.
+
+        Number 0 with an error row means that no row takes the case, which cannot happen in a table
+        that passed the check.
         """
         for number, row in self.rows.get(state, {}).items():
             if row.matches(values):
@@ -212,7 +244,11 @@ class StateTable:
 
 
 def read_table(path: Path, vocabulary: Vocabulary) -> StateTable:
-    """Return the table in a file, unchecked. Raises `TableError` when it cannot be read at all."""
+    """Read a table from a file without checking its words and states.
+
+    Raises:
+        TableError: If the file cannot be read, is not TOML, or lacks the keys of a table.
+    """
     try:
         data = read_regular_file(path, MAX_FILE_BYTES)
         config = TableConfig.model_validate(load_toml(data.decode()))
@@ -238,7 +274,16 @@ def read_table(path: Path, vocabulary: Vocabulary) -> StateTable:
 
 
 def _flaws(error: ValidationError, place: str, kind: type[Table]) -> list[str]:
-    """Return what is wrong with one table of a file, a line each."""
+    """Format the mistakes in one table of a file.
+
+    Args:
+        error: Mistakes that pydantic found.
+        place: Prefix of every line, such as "row 3: ".
+        kind: Record class of the table, which lists the known keys.
+
+    Returns:
+        One line for each mistake.
+    """
     known = ", ".join(field.alias or key for key, field in kind.model_fields.items())
     lines = []
     for entry in error.errors(include_url=False):

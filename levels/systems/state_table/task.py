@@ -1,5 +1,6 @@
-"""The task level as a state table: a static list of steps, each an object and the place to which it
-goes.
+"""The task level as a state table.
+
+Its plan is a static list of steps, each with an object and the place for it.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from rack.levels.systems.state_table.table import Name
 from rack.levels.tables import SceneConfig, Table, read_params
 
 COMMANDS_A_STEP = 2
-"""Commands for the level below in one step: one to pick, one to place."""
+"""Commands to the level below in one step: one to pick, one to place."""
 
 
 class TaskTableStatus(TableStatus, version=1):
@@ -41,12 +42,12 @@ class TaskTableStatus(TableStatus, version=1):
 
 
 class StepConfig(Table):
-    """`[[plan.step]]`: an object, and where it goes."""
+    """`[[plan.step]]`: an object and its destination."""
 
     object: str
-    """an object of the scene"""
+    """name of an object of the scene"""
     place: Name
-    """a place that the level below knows"""
+    """name of a place that the level below knows"""
 
 
 class TaskPlanConfig(Table):
@@ -57,11 +58,9 @@ class TaskPlanConfig(Table):
 
 
 class TaskTable(StateTableExecutor):
-    """Sends the commands of its steps to the level below, one after the other, as its table
-    says.
-    """
+    """Executor that sends the commands of its steps to the level below, one after the other."""
 
-    above = None  # type: ignore[assignment]  # drops the port: nothing commands it
+    above = None  # type: ignore[assignment]  # drops the port: no level is above
     below = Input(MoveTableStatus, "below.status")
     last_command = Input(TableCommand, "own.command")
     last_status = Input(TaskTableStatus, "own.status")
@@ -76,7 +75,7 @@ class TaskTable(StateTableExecutor):
             "step": ("more", "none"),
         },
         actions={
-            # To the level below, for the object or place of the step.
+            # Command the level below, with the object or place of the step.
             "send": (("pick", "place", "home"),),
             "next": (),
         },
@@ -90,11 +89,11 @@ class TaskTable(StateTableExecutor):
 
     @classmethod
     def plan_flaws(cls, scene: SceneConfig, plan: Any) -> list[str]:
-        """Return steps with unknown objects."""
+        """Return a line for each step whose object is unknown."""
         known = ", ".join(scene.objects) or "none"
         return [
-            f"plan.step[{at}].object: unknown '{step.object}'; objects: {known}"
-            for at, step in enumerate(plan.step)
+            f"plan.step[{index}].object: unknown '{step.object}'; objects: {known}"
+            for index, step in enumerate(plan.step)
             if step.object not in scene.objects
         ]
 
@@ -102,20 +101,26 @@ class TaskTable(StateTableExecutor):
     def misfits(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Misfits:
-        """Yield every mistake in every table, and steps that the level below does not know."""
-        found = [*super().misfits(context, above, below)]
-        yield from found
+        """Yield every mistake in every table, and steps that the level below does not know.
+
+        Args:
+            context: Context of this level.
+            above: Contexts of the levels above.
+            below: Contexts of the levels below, whose tables name the places.
+        """
+        own_misfits = [*super().misfits(context, above, below)]
+        yield from own_misfits
         tables = read_params(StateTableParams, context.params).tables
         for other in below:
-            if found or [*MoveTable.misfits(other, (), ())]:
+            if own_misfits or [*MoveTable.misfits(other, (), ())]:
                 continue
-            known = MoveTable.wording(Operation.DO, other.params, context.scene)
+            commands = MoveTable.wording(Operation.DO, other.params, context.scene)
             for name, path in tables.items():
-                for at, step in enumerate(cls.read(path, context.scene).plan.step):
-                    if f"place {step.place}" not in known:
+                for index, step in enumerate(cls.read(path, context.scene).plan.step):
+                    if f"place {step.place}" not in commands:
                         why = (
-                            f"plan.step[{at}].place: unknown '{step.place}'; '{other.board}' knows:"
-                            f" {', '.join(known)}"
+                            f"plan.step[{index}].place: unknown '{step.place}'; '{other.board}'"
+                            f" knows: {', '.join(commands)}"
                         )
                         yield f"params.tables.{name}", path.name, why
 
@@ -128,7 +133,7 @@ class TaskTable(StateTableExecutor):
             self._command.id = self.last_status.message.sent
 
     def look(self, tick: int) -> dict[str, str]:
-        """Return where the level below is, and whether a step is left."""
+        """Return the answer of the level below, and whether a step is left."""
         self.detail = self.below.message.reason
         self.resting = self.below.message.resting
         is_left = self._step < len(self.table.plan.step)
@@ -137,26 +142,26 @@ class TaskTable(StateTableExecutor):
             "step": ("none", "more")[is_left],
         }
 
-    def do_send(self, what: str) -> None:
-        """Command the level below."""
+    def do_send(self, verb: str) -> None:
+        """Command the level below to pick, place or go home."""
         steps = self.table.plan.step
         step = steps[min(self._step, len(steps) - 1)]
         words = {"pick": f"pick {step.object}", "place": f"place {step.place}", "home": "home"}
         self._command.id += 1
-        self._command.words = words[what]
+        self._command.words = words[verb]
 
     def do_next(self) -> None:
-        """Go on to the next step."""
+        """Advance to the next step."""
         self._step += 1
 
     def give(self, tick: int) -> None:
-        """Write the command, and the progress."""
+        """Write the command and the progress."""
         self._command.hold = self.holds
         self.command.copy_from(self._command)
-        shown = self.status
+        status = self.status
         steps = len(self.table.plan.step)
-        shown.action = min(self._step, steps)
-        shown.actions = steps
-        shown.sent = self._command.id
-        shown.moves = steps * COMMANDS_A_STEP
-        shown.moves_done = shown.action * COMMANDS_A_STEP
+        status.action = min(self._step, steps)
+        status.actions = steps
+        status.sent = self._command.id
+        status.moves = steps * COMMANDS_A_STEP
+        status.moves_done = status.action * COMMANDS_A_STEP

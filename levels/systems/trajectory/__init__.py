@@ -1,6 +1,4 @@
-"""A trajectory level that follows a queue of motion requests, and the planning level that queues
-them.
-"""
+"""A trajectory level that carries out queued motion requests, and the level that plans them."""
 
 from rack.levels.systems.trajectory.executor import TrajectoryExecutor
 from rack.levels.systems.trajectory.planner import RequestExecutor, RequestPlanner

@@ -1,4 +1,4 @@
-"""Whether all boards that servo joints follow set points: motion continues only while they do."""
+"""Supervision of the boards that servo joints: motion continues only while all of them follow."""
 
 from __future__ import annotations
 
@@ -11,44 +11,53 @@ from rack.levels.level import Reading
 from rack.levels.systems.joint_boards.messages import JointStatus
 
 HANDOVER_CYCLES = 4
-"""Cycles from the first set point until the boards' statuses must show that they follow."""
+"""Cycles after the first set point within which the boards' statuses must show that they follow."""
 MAX_SILENT_CYCLES = 3
-"""Consecutive cycles without a new status after which a board is silent."""
+"""Number of consecutive cycles that a board may spend without a new status."""
 MAX_REST_RAD_S = 1e-3
-"""A joint whose set point is slower than this rests."""
+"""A joint is at rest while its set point is slower than this."""
 
 
 class JointBoards:
-    """Decides from the boards' statuses whether they are in step with this level, all or none.
+    """Decides from the boards' statuses whether all of them are in step with this level.
 
-    One that is lost, stopped or left alone lets all fall out of step: none gets set points, so each
-    ramps to rest by itself. They get back into step when all hold at rest; motion continues from
-    there.
+    When one board is lost, stopped or left alone, all fall out of step: no board gets set points,
+    and each ramps to rest independently. They return to step when all of them hold at rest, and
+    motion continues from these positions.
+
+    Attributes:
+        in_step: Whether the boards follow this level's set points.
+        position: Joint positions at which the boards hold the joints, (joints,), rad.
+        wait_reason: Reason for which a level out of step is waiting.
     """
 
     def __init__(
         self, joints: Sequence[str], ranges: Array, handover: int = HANDOVER_CYCLES
     ) -> None:
-        """Await the joints' answer to the first set point for `handover` cycles. `ranges`,
-        (joints, 2), rad: where joints can be.
+        """Start out of step.
+
+        Args:
+            joints: Names of all joints.
+            ranges: Lower and upper position limit of each joint, (joints, 2), rad.
+            handover: Cycles after the first set point until the boards must follow.
         """
         self._joints = joints
         self._low, self._high = ranges.T
         self._handover = handover
         self.in_step = False
-        self.position = np.zeros(len(joints))  # (joints,), rad: where the boards hold the joints
-        self._cycles = 0  # since they got into step
+        self.position = np.zeros(len(joints))  # (joints,), rad
+        self._cycles = 0  # since the boards came into step
         self._silent: dict[str, int] = {}  # consecutive cycles without a new status, by board
-        self.awaited = "no board servoes a joint"  # what a level out of step waits for
+        self.awaited = "no board servoes a joint"
 
     def update(self, statuses: Mapping[str, Reading[JointStatus]]) -> bool:
-        """Read all statuses; return True in the cycle in which the boards get into step."""
+        """Read all statuses. Returns True in the cycle in which the boards come into step."""
         self._cycles += 1
         for board, reading in statuses.items():
-            heard = reading.is_new and not reading.is_lost
-            self._silent[board] = 0 if heard else self._silent.get(board, 0) + 1
-        if why := self._kept(statuses):
-            self.leave(f"waiting for {why}")
+            has_status = reading.is_new and not reading.is_lost
+            self._silent[board] = 0 if has_status else self._silent.get(board, 0) + 1
+        if reason := self._kept(statuses):
+            self.leave(f"waiting for {reason}")
             return False
         if self.in_step or not self._hold(statuses):
             return False
@@ -56,20 +65,21 @@ class JointBoards:
         self._cycles = 0
         return True
 
-    def leave(self, why: str) -> None:
-        """Let all fall out of step: they come to rest by themselves, and motion begins again from
-        where they hold.
-        """
+    def leave(self, reason: str) -> None:
+        """Fall out of step. The boards bring the joints to rest, where motion restarts later."""
         self.in_step = False
-        self.awaited = why
+        self.awaited = reason
 
     def _kept(self, statuses: Mapping[str, Reading[JointStatus]]) -> str:
-        """Return the board that does not follow, and why; empty: all do, or could."""
+        """Return the board that does not follow, with the reason.
+
+        Empty if no board prevents motion.
+        """
         for board, reading in statuses.items():
             status = reading.message
-            silent = self._silent[board]
-            if silent > MAX_SILENT_CYCLES or not reading.is_there:
-                return f"{board}: no status for {silent} cycles"
+            silent_cycles = self._silent[board]
+            if silent_cycles > MAX_SILENT_CYCLES or not reading.is_there:
+                return f"{board}: no status for {silent_cycles} cycles"
             if status.stopped:
                 return f"{board}: {status.reason or 'it does not follow set points'}"
             if self.in_step and status.holding and self._cycles > self._handover:
@@ -77,24 +87,24 @@ class JointBoards:
         return ""
 
     def _hold(self, statuses: Mapping[str, Reading[JointStatus]]) -> bool:
-        """Return whether all boards hold all joints at rest; take over where."""
-        driven = np.zeros(len(self._joints), dtype=bool)
+        """Return True if all boards hold all joints at rest. Takes over the positions they hold."""
+        is_driven = np.zeros(len(self._joints), dtype=bool)
         for board, reading in statuses.items():
             status = reading.message
-            mine = status.driven.astype(bool)
-            # Written so that NaN does not count as rest, nor as a place.
-            resting = (np.abs(status.target_velocity[mine]) <= MAX_REST_RAD_S).all()
-            if self._silent[board] or not (status.holding and resting):
+            own_joints = status.driven.astype(bool)
+            # Both comparisons are written such that NaN is neither at rest nor in range.
+            are_resting = (np.abs(status.target_velocity[own_joints]) <= MAX_REST_RAD_S).all()
+            if self._silent[board] or not (status.holding and are_resting):
                 self.awaited = f"waiting for {board}: it does not hold its joints at rest"
                 return False
-            inside = (self._low <= status.target) & (status.target <= self._high)
-            if (astray := mine & ~inside).any():
-                joint = int(astray.argmax())
+            is_in_range = (self._low <= status.target) & (status.target <= self._high)
+            if (is_outside := own_joints & ~is_in_range).any():
+                joint = int(is_outside.argmax())
                 place = f"'{self._joints[joint]}' at {status.target[joint]:.3g} rad"
                 self.awaited = f"waiting for {board}: it holds {place}, out of its range"
                 return False
-            self.position[mine] = status.target[mine]
-            driven |= mine
-        if not driven.all():
-            self.awaited = f"no board servoes joint '{self._joints[int(driven.argmin())]}'"
-        return bool(driven.all())
+            self.position[own_joints] = status.target[own_joints]
+            is_driven |= own_joints
+        if not is_driven.all():
+            self.awaited = f"no board servoes joint '{self._joints[int(is_driven.argmin())]}'"
+        return bool(is_driven.all())

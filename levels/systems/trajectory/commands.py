@@ -1,5 +1,4 @@
-"""A command environment on the host side: motions as plain Python calls, in a script or at a
-prompt.
+"""A host-side command environment: motions as Python calls, in a script or at a prompt.
 
     move(joints)                  a straight line in joint space
     line(position, ...)           a straight line of the tool, in the world's frame or a body's
@@ -7,9 +6,9 @@ prompt.
     cancel()                      drop everything; the arm ramps to rest
     done(), wait()                whether all is done; wait until it is
 
-A call returns as soon as its request is on its way: requests are queued, and blended. It waits only
-while the queue is full. A request that is lost, with a board that died as it held it, is sent again
-by the next call that waits.
+A call returns as soon as its request is queued, and blocks only while the queue is full. Successive
+motions are blended. A request may be lost with a board that dies while it holds the request; the
+next call that waits sends it again.
 """
 
 from __future__ import annotations
@@ -39,18 +38,20 @@ from rack.levels.systems.trajectory.messages import (
 from rack.levels.tables import GripperConfig, Table, read_params
 
 DOWN = (0.0, 1.0, 0.0, 0.0)
-"""Orientation of a tool that points straight down, w, x, y, z."""
+"""Orientation of a tool that points straight down, as quaternion w, x, y, z."""
 LOOK_S = 0.25
+"""Longest wait before the status is read again, s."""
 PATIENCE_S = 2.0
-"""Time for which nothing is under way, though requests are open, before they are sent again."""
+"""Time after which open requests are sent again if none of them is under way, s."""
 WORLD = -1
+"""Body number of a goal in the frame of the world."""
 
 
 class Motions:
-    """Motion requests as calls: scripts and prompts have its public methods by name. A request
-    returns its number.
+    """Motion requests as method calls, each of which returns the number of its request.
 
-    What a former process of the board has left in the queue is cancelled first.
+    Scripts and prompts use the public methods by name. Requests that an earlier process of the
+    board left in the queue are cancelled first.
     """
 
     def __init__(
@@ -65,16 +66,21 @@ class Motions:
         self._requests = requests
         self._robot = context.robot
         self._bodies = context.scene.bodies
-        # No request of a former process has a greater number than it has sent messages.
+        # Every request of an earlier process has a number up to the count of messages sent.
         self._newest = requests.sent
         self._open: dict[int, dict[str, Any]] = {}  # requests that have not ended, by number
-        # Time since when nothing is under way, though requests are open.
+        # Time at which requests were first seen open with none under way, s.
         self._idle_since: float | None = None
         if self._newest:
             self.cancel()
 
     def move(self, joints: Sequence[float] | None = None, **times: float) -> int:
-        """Go to joint positions, rad, in a straight line in joint space; default: home."""
+        """Move in a straight line in joint space.
+
+        Args:
+            joints: Goal, (joints,), rad. None moves to the home position.
+            **times: Fields `segment` and `acceleration` of the request, s.
+        """
         goal = self._robot.home if joints is None else joints
         return self._request(kind=MotionKind.JOINTS, joints=goal, **times)
 
@@ -87,15 +93,27 @@ class Motions:
         guard: float = 0.0,
         **times: float,
     ) -> int:
-        """Move the tool to a pose, m, in a straight line; in the frame of a `body`, which a `live`
-        goal follows.
+        """Move the tool in a straight line to a pose.
 
-        With a `guard`, N m, it ends GUARDED where a joint's torque changes by more: the arm met
-        something.
+        Args:
+            position: Goal of the tool, m, in the frame of `body`.
+            quaternion: Orientation of the tool, w, x, y, z, in the same frame.
+            body: Object or obstacle in whose frame the goal is. Empty for the world.
+            live: Whether the goal follows the body. Otherwise its frame is copied when the motion
+                begins.
+            guard: Change of any joint's torque, N m, at which the motion ends GUARDED, because the
+                arm has touched something. 0 for no guard.
+            **times: Fields `segment` and `acceleration` of the request, s.
+
+        Returns:
+            Number of the request.
+
+        Raises:
+            LevelError: If the body is not in the scene.
         """
         if body and body not in self._bodies:
             raise LevelError(
-                f"line: body = {body}: not in the scene; permitted: {', '.join(self._bodies)}"
+                f"line: body = {body}: not in the scene; its bodies are {', '.join(self._bodies)}"
             )
         frame = self._bodies.index(body) if body else WORLD
         return self._request(
@@ -109,11 +127,11 @@ class Motions:
         )
 
     def stay(self, seconds: float) -> int:
-        """Stay at the goal before."""
+        """Stay at the previous goal for some seconds, following it if it is live."""
         return self._request(kind=MotionKind.STAY, segment=seconds)
 
     def grip(self, opening: float | None = None, force: float | None = None) -> int:
-        """Bring the gripper to an opening, m, with at most `force`, N; default: close it."""
+        """Move the gripper to an opening, m, with at most `force`, N. The default closes it."""
         if opening is None:
             opening = self._gripper.closed
         if force is None:
@@ -131,23 +149,24 @@ class Motions:
         return self._robot.gripper
 
     def cancel(self) -> int:
-        """End the motion under way and drop all others; the arm ramps to rest."""
+        """End the motion under way and drop all others. The arm ramps to rest."""
         return self._request(kind=MotionKind.CANCEL)
 
     def end_of(self, request: int) -> RequestEnd:
-        """Return how a request ended: NONE until it has, or if it is too long ago."""
+        """Return how a request ended. NONE if it is still open or ended too long ago."""
         status = self._status
         ends = dict(zip(status.ended.tolist(), status.ends.tolist(), strict=True))
         return RequestEnd(ends.get(request, RequestEnd.NONE))
 
     def done(self, request: int | None = None) -> bool:
-        """Return whether a request, by default the newest, has ended."""
-        number = self._newest if request is None else request
-        return bool(self._status.done >= number)
+        """Return True if a request, by default the newest, has ended."""
+        return bool(self._status.done >= (self._newest if request is None else request))
 
     def wait(self, request: int | None = None, until: Callable[[], bool] = lambda: False) -> bool:
-        """Wait until a request, by default the newest, has ended; False if `until` holds before, or
-        the run ends.
+        """Wait until a request, by default the newest, has ended.
+
+        Returns:
+            False if `until` became true before, or the run ended.
         """
         while not self.done(request):
             if until() or self._bus.is_over:
@@ -156,15 +175,16 @@ class Motions:
         return True
 
     def where(self) -> list[float]:
-        """Return the tool position commanded last, m."""
+        """Return the tool position that was commanded last, m."""
         return [round(float(x), 4) for x in self._status.tool]
 
     @property
     def _status(self) -> MotionStatus:
-        """The newest status of the level that moves the arm."""
+        """Newest status of the level that moves the arm."""
         return self._motion.read().message
 
     def _request(self, **fields: Any) -> int:
+        """Queue a request, waiting while the queue is full, and return its number."""
         request = {"body": WORLD, **fields, "id": self._newest + 1}
         while not self._send(request):
             if self._bus.is_over:
@@ -175,20 +195,19 @@ class Motions:
         return self._newest
 
     def _send(self, fields: Mapping[str, Any]) -> bool:
-        """Send a request with these fields, all others 0. Raises `AttributeError` for an unknown
-        field.
+        """Send a request with these fields, all others being zero.
+
+        Returns False if the queue is full. Raises `AttributeError` for an unknown field.
         """
         request = self._requests.message
-        # One that was refused, or had an unknown field, has left its fields.
+        # The message still contains the fields of a request that could not be sent.
         request.clear()
         for name, value in fields.items():
             setattr(request, name, value)
         return self._requests.send()
 
     def _look(self) -> None:
-        """Wait for news; send the requests again that are lost: nothing is under way, and not all
-        are done.
-        """
+        """Wait for a new status. Send open requests again if none is under way for too long."""
         self._bus.wait(LOOK_S)
         status = self._status
         now = self._bus.time_s
@@ -201,7 +220,7 @@ class Motions:
             self._idle_since = now
         elif now - self._idle_since > PATIENCE_S:
             self._idle_since = None
-            # One that only waits is there twice then, and done once.
+            # A request that was only waiting is now queued twice, but carried out once.
             for request in self._open.values():
                 self._send(request)
 
@@ -210,11 +229,11 @@ class ScriptParams(Table):
     """`[host.<name>.params]`: the script of a command environment."""
 
     script: str
-    """Python script to run, in a folder of python_path"""
+    """Python script to run, found in a folder of python_path"""
 
 
 class CommandEnvironment(HostProgram):
-    """Runs a script that commands motions by name; a prompt offers the same names."""
+    """Host program that runs a script of motion calls. A prompt offers the same names."""
 
     motion = ProgramInput(MotionStatus, "below.motion")
     requests = ProgramOutput(MotionRequest)
@@ -225,7 +244,7 @@ class CommandEnvironment(HostProgram):
         self._script = read_params(ScriptParams, context.params).script
 
     def run(self, bus: Bus) -> None:
-        """Run the script; raises `LevelError` if there is no such file."""
+        """Run the script. Raises `LevelError` if no folder of the path contains it."""
         paths = [Path(folder) / self._script for folder in sys.path]
         script = next(filter(Path.is_file, paths), None)
         if script is None:
@@ -233,11 +252,11 @@ class CommandEnvironment(HostProgram):
         runpy.run_path(str(script), {"bus": bus, "program": self, **self.names(bus)}, "__main__")
 
     def names(self, bus: Bus) -> Mapping[str, Any]:
-        """Return the calls, by name."""
+        """Return the calls that a script may use, by name."""
         motions = self.motions(bus)
         calls = {name: getattr(motions, name) for name in dir(motions) if name[0] != "_"}
         return {"motions": motions, **calls}
 
     def motions(self, bus: Bus) -> Motions:
-        """Return what makes requests of calls."""
+        """Build the object whose methods queue motion requests."""
         return Motions(bus, self.motion, self.requests, self.context)

@@ -1,5 +1,6 @@
-"""The executor of a trajectory level: follows the motion requests of its queue with a set point
-every cycle.
+"""The executor of a trajectory level, which carries out queued motion requests.
+
+It sends a set point in every cycle.
 """
 
 from __future__ import annotations
@@ -34,20 +35,22 @@ from rack.levels.systems.trajectory.requests import Agenda
 from rack.levels.tables import read_params
 
 LEAD_CYCLES = 2
-"""Cycles from the release that makes a set point to the tick at which it is due.
+"""Cycles from the release that computes a set point to the tick at which it is due.
 
-One brings it to the boards that servo joints, which interpolate to it over the second one."""
+The first cycle transports it to the boards that servo joints. During the second they interpolate to
+it.
+"""
 
 
 class TrajectoryExecutor(Executor):
-    """Does motion requests in the order of the queue, blended; when it is empty, the arm rests at
-    the last goal.
+    """Carries out motion requests in the order of the queue, and blends them.
 
-    It needs no board above: what is queued is done. While a board below is lost or stopped, and on
-    an operator's hold, the arm rests; the request under way then goes on from there. A request that
-    cannot be done ends REFUSED, or FAILED on the way: the arm ramps to rest, all others held are
-    CANCELLED, those that come are REFUSED until a CANCEL [assumed]. After a restart the level
-    continues with the requests in its own last messages.
+    The arm rests at the last goal when the queue is empty. The level needs no board above it: what
+    is queued will be done. While a board below is lost or stopped, or an operator holds the level,
+    the arm rests, and the request under way resumes afterwards. A request that cannot be done ends
+    REFUSED, or FAILED if it was under way: the arm ramps to rest, all others held are CANCELLED,
+    and new ones are REFUSED until a CANCEL [assumed]. After a restart the level continues with the
+    requests in its own last messages.
     """
 
     requests = Input(MotionRequest, "above.requests")
@@ -64,7 +67,7 @@ class TrajectoryExecutor(Executor):
     params: ClassVar[type[TrajectoryParams]] = TrajectoryParams
     preloads = (dynamics,)
     work: ClassVar[type[RequestWork]] = RequestWork
-    """Does the requests."""
+    """Class that begins, blends and ends the requests."""
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
@@ -83,16 +86,17 @@ class TrajectoryExecutor(Executor):
         self._dynamics = Dynamics(cell)
         if robot.gripper is not None:
             self._work.grip = robot.gripper.open, robot.gripper.force
-        self._tick: int | None = None  # of the last cycle
-        self._saved: tuple[int, ...] = ()  # what the last state depends on
+        self._tick: int | None = None  # of the last cycle; None before the first one
+        # Numbers of requests on which the last saved state depends.
+        self._saved: tuple[int, ...] = ()
 
     def room(self, port: str) -> int:
-        """Return how many requests to take: the rest waits in the queue."""
-        # None before the level has recalled those that it has already.
+        """Return how many requests to take now. The others stay in the queue."""
+        # Take none before the requests of an earlier process are restored.
         return 0 if self._tick is None else self._agenda.room
 
     def process(self, tick: int) -> None:
-        """Take requests, go on with the motion, write the set point of two cycles later."""
+        """Take requests, advance the motion, and write the set point that is due in two cycles."""
         if self._tick is None:
             self._recall()
             self._tick = tick - self.context.every
@@ -102,7 +106,7 @@ class TrajectoryExecutor(Executor):
         self._sight.look(self.world)
         cancelled = self._agenda.take(self.requests)
         if cycles > HANDOVER_CYCLES and self._boards.in_step:
-            # The boards hold by now. Across a network their statuses say so too late.
+            # The boards hold by now. Over a network their statuses would show it too late.
             self._boards.leave(f"{cycles} cycles missed: the boards hold")
             self._work.interrupt()
         self._follow_boards()
@@ -110,24 +114,24 @@ class TrajectoryExecutor(Executor):
             self._work.cancel()
         self._watch(cycles)
         hold = self._orders.holds
-        # Samples of cycles that were missed are made up, so that no time is lost; beyond a few the
-        # boards hold.
-        for late in reversed(range(min(cycles, HANDOVER_CYCLES))):
+        # Catch up on the samples of missed cycles, to lose no time. After more than a few missed
+        # cycles the boards hold.
+        for late_cycles in reversed(range(min(cycles, HANDOVER_CYCLES))):
             if self._boards.in_step:
-                due = self._due(tick) - late * self.context.every
-                self._work.step(due * self.context.tick_s, hold)
+                due_tick = self._due(tick) - late_cycles * self.context.every
+                self._work.step(due_tick * self.context.tick_s, hold)
         self._write_reference(self.command, tick)
         self._write_status(self.status)
         agenda = self._agenda
         self.state.passed = self._work.passed_s
-        goal = 0 if agenda.goal is None else agenda.goal.id
-        newest = (agenda.taken, agenda.done, agenda.begun, goal)
-        if newest != self._saved:
-            self._saved = newest
+        goal_id = 0 if agenda.goal is None else agenda.goal.id
+        newest_ids = (agenda.taken, agenda.done, agenda.begun, goal_id)
+        if newest_ids != self._saved:
+            self._saved = newest_ids
             agenda.save(self.state)
 
     def _recall(self) -> None:
-        """Continue after a restart, from the level's own last messages."""
+        """Continue from the level's own last messages after a restart."""
         if self.last_state.is_there and self.last_status.is_there:
             self._agenda.recall(self.last_state.message, self.last_status.message)
             self._work.recall(self.last_state.message.passed, self.last_status.message.progress)
@@ -136,21 +140,26 @@ class TrajectoryExecutor(Executor):
             self._work.grip = command.opening, command.force
 
     def _follow_boards(self) -> None:
-        """Fall out of step with the boards below, or begin anew from where they hold the arm."""
-        before = self._boards.in_step
+        """Fall out of step with the boards below, or restart from where they hold the arm."""
+        was_in_step = self._boards.in_step
         if self._boards.update(self.boards):
             self._work.interrupt()
             self._motion.rest_at(self._boards.position)
-        elif before and not self._boards.in_step:
+        elif was_in_step and not self._boards.in_step:
             self._work.interrupt()
 
     def _watch(self, cycles: int) -> None:
-        """End the request under way if its guard is struck; `cycles` since the last one."""
+        """End the request under way if its guard is struck.
+
+        Args:
+            cycles: Cycles since the previous call. After missed cycles torques are not comparable.
+        """
         current = self._agenda.current
         leg = self._motion.leg
-        # At half its speed the arm has long broken away from rest, where friction changes torques.
-        steady = cycles == 1 and leg is not None and self._motion.leg_s >= leg.law.half_blend_s
-        if current is None or current.kind != MotionKind.POSE or not current.touch or not steady:
+        # Friction changes the torques while the arm breaks away from rest. At half its speed this
+        # is long past.
+        is_steady = cycles == 1 and leg is not None and self._motion.leg_s >= leg.law.half_blend_s
+        if current is None or current.kind != MotionKind.POSE or not current.touch or not is_steady:
             self._guard.begin_anew()
         elif self._guard.is_struck(self.boards, current.touch):
             self._work.end_guarded()
@@ -161,7 +170,7 @@ class TrajectoryExecutor(Executor):
     def _write_reference(self, command: JointReference, tick: int) -> None:
         state = self._motion.state
         command.id = tick // self.context.every + 1
-        # Out of step the arm's position is not certain: no set point is better than a wrong one.
+        # Out of step the arm's position is uncertain, and no set point is better than a wrong one.
         command.due = self._due(tick) if self._boards.in_step else 0
         command.position, command.velocity, command.acceleration = state
         terms = self._dynamics.terms(state.position, state.velocity)
@@ -200,6 +209,7 @@ class TrajectoryExecutor(Executor):
         self._orders.report(status, agenda.rests_on)
 
     def _reason_to_wait(self) -> str:
+        """Return why motion does not continue. Empty if it does."""
         if not self._boards.in_step:
             return self._boards.awaited
         if self._orders.stands:
@@ -215,17 +225,19 @@ class TrajectoryExecutor(Executor):
 
 
 LASTS_S = 0.04
-"""Parts of the window, at its begin and end, whose medians are compared: what a late cycle or a
-short braking leaves behind decays within half of it. The window is five times as long: over more,
-slow motion changes torques by itself."""
+"""Length of the two medians that are compared, at the start and end of the window, s.
+
+Effects of a late cycle or a short braking decay within half of it. The window is five times as
+long. In a longer window, slow motion alone would change the torques.
+"""
 
 
 class TouchGuard:
-    """A lasting change of a joint's torque, as where the arm meets something, ends a motion.
+    """Detects contact of the arm by a lasting change of a joint's torque.
 
-    It compares torques, N m, at the end of its window with those at its begin; one sample a cycle.
-    They also change when the arm brakes, holds, or goes on after missed cycles: across one of these
-    a change is no touch, and the window begins anew.
+    It compares the torques, N m, at the end of its window with those at the start, one sample per
+    cycle. Torques also change when the arm brakes, holds, or continues after missed cycles. Such a
+    change is not a contact, and therefore clears the window.
     """
 
     def __init__(self, period_s: float) -> None:
@@ -233,11 +245,19 @@ class TouchGuard:
         self._past: deque[Array] = deque(maxlen=5 * self._lasting)
 
     def begin_anew(self) -> None:
-        """Forget the torques so far."""
+        """Forget all torques so far."""
         self._past.clear()
 
-    def is_struck(self, boards: Mapping[str, Reading[JointStatus]], most: float) -> bool:
-        """Return whether the torque of a joint has changed by more than `most`, N m."""
+    def is_struck(self, boards: Mapping[str, Reading[JointStatus]], max_change: float) -> bool:
+        """Add the torques of this cycle, and check whether they have changed.
+
+        Args:
+            boards: Statuses of the boards that servo joints.
+            max_change: Largest change of a joint's torque without contact, N m.
+
+        Returns:
+            True if the torque of a joint has changed by more than `max_change`.
+        """
         if all(board.is_new and not board.message.holding for board in boards.values()):
             self._past.append(np.sum([board.message.torque for board in boards.values()], axis=0))
         else:
@@ -247,4 +267,4 @@ class TouchGuard:
         if len(past) < 2 * count:
             return False
         change = np.median(past[-count:], axis=0) - np.median(past[:count], axis=0)
-        return bool(np.abs(change).max() > most)
+        return bool(np.abs(change).max() > max_change)

@@ -1,16 +1,16 @@
-"""Legs: motions from rest to rest, straight in joint space or of the tool, as functions of time.
+"""Legs: motions from rest to rest, straight in joint space or for the tool, as functions of time.
 
-A leg of segment time T and half blend time a lasts T + 2a: its speed rises over 2a, stays, and
-falls over 2a. Its bends take at most half the acceleration of every joint, so a leg that begins
-while the one before it slows down keeps the limits. This is the straight path with polynomial
-transitions of RCCL [recalled]: two legs in sequence, the second begun a before the first ends, are
-one motion with matched position, velocity and acceleration.
+A leg with segment time T and half blend time a lasts T + 2a: its speed rises during 2a, remains
+constant, and falls during 2a. A leg uses at most half of each joint's acceleration limit, which
+keeps the limits when a leg begins while the previous one slows down. This is RCCL's straight path
+with polynomial transitions [recalled]: two overlapping legs are one motion with continuous
+position, velocity and acceleration.
 
-The goal of a tool path is fixed, or in the frame of a body of the world model that it follows.
-A live goal is RCCL's functional transform: its function runs once for every sample, and an age
-stamp keeps a second reader of the same sample from running it again [S7]. The frame is extrapolated
-from when the body was sensed to the sample's time, and smoothed: a body may start with a jolt, an
-arm cannot. The smoothed frame catches up with a body of constant velocity completely.
+The goal of a tool path is fixed, or follows a body of the world model. A live goal is RCCL's
+functional transform: its function runs once per sample, and an age stamp prevents a second
+evaluation for the same sample [S7]. The frame is extrapolated from the time at which the body was
+sensed to the time of the sample. It is also smoothed, because a body may start with a jolt and an
+arm cannot. For a body of constant velocity the smoothed frame has no lag in the end.
 """
 
 from __future__ import annotations
@@ -30,44 +30,54 @@ from rack.levels.robot.limits import Limits
 from rack.levels.systems.trajectory.messages import MotionRequest
 
 BLEND_PART = 0.5
-"""Part of the acceleration limits that one leg takes: two blended ones take all."""
+"""Fraction of the acceleration limits that one leg uses. Two blended legs use all of them."""
 PEAK = 0.75
-"""Greatest acceleration of a change of speed by 1 over 2a, times a."""
+"""Peak acceleration of a change of speed by 1 during 2a, times a."""
 STEP_M = 0.04
+"""Largest distance between poses of a tool path that are tested before it begins, m."""
 STEP_RAD = 0.1
-"""Distance and turn between the poses of a tool path that are tried before it begins."""
+"""Largest turn between such poses, rad."""
 MAX_STEPS = 40
+"""Largest number of poses of a tool path that are tested."""
 SAMPLED = 1.15
-"""Factor on speeds and bends of a tool path that were found at its tried poses: between them they
-may be greater."""
+"""Safety factor on the derivatives found at the tested poses of a tool path.
+
+Between these poses they may be greater.
+"""
 
 
 class Unfit(Exception):
-    """A motion that the arm cannot make; its text says why."""
+    """Raised for a motion that the arm cannot make. The text gives the reason."""
 
 
 class WorldSight:
-    """The world model as of this cycle, extrapolated."""
+    """The world model as known in this cycle, with extrapolated bodies."""
 
     def __init__(self, bodies: tuple[str, ...], blind_s: float, tick_s: float) -> None:
-        """See `bodies`, in the model's order; extrapolate for `blind_s` at most."""
+        """Start without a model.
+
+        Args:
+            bodies: Names of the bodies, in the order of the world model.
+            blind_s: Longest time for which the motion of a body is extrapolated, s.
+            tick_s: Period of the system clock, s.
+        """
         self._bodies = bodies
         self._blind_s = blind_s
         self._tick_s = tick_s
         self._model: WorldState | None = None
 
     def look(self, world: Reading[WorldState]) -> None:
-        """Take over the newest model."""
+        """Take over the newest world model, if it has been sensed."""
         if world.is_there and world.message.revision:
             self._model = world.message
 
     @property
     def knows(self) -> bool:
-        """Whether anything has been sensed."""
+        """Whether a world model has been received."""
         return self._model is not None
 
     def misfit(self, row: int) -> str:
-        """Return why the world model has no such body; empty: it has."""
+        """Return why the world model has no body with this row. Empty if it has one."""
         if -1 <= row < len(self._bodies):
             return ""
         return (
@@ -76,119 +86,162 @@ class WorldSight:
         )
 
     def frame(self, row: int, time_s: float) -> tuple[Pose, Array]:
-        """Return where body `row` should be at `time_s`, and its velocity (3,), m/s; zero for one
-        not seen lately.
+        """Predict the frame and the velocity of a body.
+
+        Args:
+            row: Row of the body in the world model.
+            time_s: Simulated time of the prediction, s.
+
+        Returns:
+            The pose, and the velocity, (3,), m/s. The velocity is zero if the body was not sensed
+            lately.
+
+        Raises:
+            InfeasibleMotion: If no world model has been received.
         """
         model = self._model
         if model is None:
             raise Unfit("nothing is known of the world")
         ahead_s = time_s - model.sensed * self._tick_s
         velocity = np.array(model.velocity[row]) if ahead_s <= self._blind_s else np.zeros(3)
-        place = model.position[row] + model.velocity[row] * min(ahead_s, self._blind_s)
-        return pose(place, model.quaternion[row]), velocity
+        position = model.position[row] + model.velocity[row] * min(ahead_s, self._blind_s)
+        return pose(position, model.quaternion[row]), velocity
 
 
 class ToolGoal:
-    """The goal of one request."""
+    """Goal of one tool motion, fixed or live.
+
+    Attributes:
+        pose: Goal of the tool in the world, for the sample that was evaluated last.
+        live: Whether the goal follows a body.
+    """
 
     def __init__(self, request: MotionRequest, sight: WorldSight, follow_s: float) -> None:
-        """Follow a live goal with the time constant `follow_s`."""
+        """Start at the pose of the request.
+
+        Args:
+            request: Request of kind POSE.
+            sight: Gives the frame of the body.
+            follow_s: Time constant with which a live goal follows its body, s.
+        """
         self._goal = pose(request.position, request.quaternion)  # in the frame of the body
-        self._body = request.body  # row in the world model; -1: the world
+        self._body = request.body  # row in the world model, -1 for the world
         self.live = request.live and request.body >= 0
         self._sight = sight
         self._follow_s = follow_s
-        self._stamp_s = -1.0  # of the sample for which `pose` was evaluated
+        self._stamp_s = -1.0  # time of the sample for which `pose` was evaluated
         self._frame: Pose | None = None
         self._velocity = np.zeros(3)
         self._turning = np.zeros(3)
-        self.pose = self._goal  # of the tool, for that sample
+        self.pose = self._goal
 
     def update(self, time_s: float) -> None:
-        """Evaluate the goal for the sample at `time_s`; again for the same one does nothing. Raises
-        `Unfit`.
+        """Evaluate the goal for the sample at `time_s`. A second call for a sample has no effect.
+
+        Raises:
+            InfeasibleMotion: If no world model has been received.
         """
         if self._body < 0 or time_s == self._stamp_s or (self._frame is not None and not self.live):
             return
-        seen, velocity = self._sight.frame(self._body, time_s)
+        body_frame, velocity = self._sight.frame(self._body, time_s)
         if self._frame is None:
-            self._frame = seen
+            self._frame = body_frame
             self._velocity = velocity
         else:
-            self._frame = self._followed(self._frame, seen, velocity, time_s - self._stamp_s)
+            self._frame = self._followed(self._frame, body_frame, velocity, time_s - self._stamp_s)
         self._stamp_s = time_s
         self.pose = self._frame @ self._goal
 
     def astray(self, position: Array, time_s: float) -> float:
-        """Return the distance, m, of a tool position at `time_s` from the goal on the body,
-        unsmoothed.
-        """
+        """Return the distance of a tool position from the unsmoothed goal at `time_s`, m."""
         return norm((self._sight.frame(self._body, time_s)[0] @ self._goal).position - position)
 
-    def _followed(self, frame: Pose, seen: Pose, velocity: Array, passed_s: float) -> Pose:
-        """Return the frame that goes after the body, critically damped; its turning is followed
-        with a lag.
+    def _followed(self, frame: Pose, body_frame: Pose, velocity: Array, step_s: float) -> Pose:
+        """Return the frame after one step of following the body.
+
+        The position is critically damped and follows a constant velocity without lag. The
+        orientation is followed with a lag.
+
+        Args:
+            frame: Smoothed frame of the previous sample.
+            body_frame: Predicted frame of the body.
+            velocity: Velocity of the body, (3,), m/s.
+            step_s: Time since the previous sample, s.
         """
-        pace = 1.0 / self._follow_s
-        turn = np.zeros(3)
+        rate = 1.0 / self._follow_s
+        rotation_error = np.zeros(3)
         quaternion = frame.quaternion.copy()
-        mujoco.mju_subQuat(turn, seen.quaternion, quaternion)
-        # The body moves at its velocity in the step that ends at `seen`.
-        off = seen.position - velocity * passed_s - frame.position
-        self._velocity = self._velocity + passed_s * pace * (
-            pace * off + 2.0 * (velocity - self._velocity)
+        mujoco.mju_subQuat(rotation_error, body_frame.quaternion, quaternion)
+        # The body moves at its velocity during the step that ends at `body_frame`.
+        position_error = body_frame.position - velocity * step_s - frame.position
+        self._velocity = self._velocity + step_s * rate * (
+            rate * position_error + 2.0 * (velocity - self._velocity)
         )
-        self._turning = self._turning + passed_s * pace * (pace * turn - 2.0 * self._turning)
-        mujoco.mju_quatIntegrate(quaternion, self._turning, passed_s)
-        return pose(frame.position + passed_s * self._velocity, quaternion)
+        self._turning = self._turning + step_s * rate * (
+            rate * rotation_error - 2.0 * self._turning
+        )
+        mujoco.mju_quatIntegrate(quaternion, self._turning, step_s)
+        return pose(frame.position + step_s * self._velocity, quaternion)
 
 
 class Times(NamedTuple):
-    """Times that a request wants, s."""
+    """Times that a request asks for, s."""
 
-    segment: float  # 0: from the limits
+    segment: float  # 0 to choose it from the limits
     half_blend: float
 
 
 class TimeLaw:
-    """The part of the way done, 0 to 1, by the time since the begin."""
+    """Progress along a leg, 0 to 1, as a function of the time since its start.
 
-    def __init__(self, segment_s: float, half_blend_s: float, least_s: float = 0.0) -> None:
+    Attributes:
+        segment_s: Time of the segment, s.
+        half_blend_s: Half the time in which the speed rises at the start, s.
+        min_end_blend_half_s: Shortest permitted value of `end_blend_half_s`, s.
+        end_blend_half_s: Half the time in which the speed falls at the end, s. It is positive, and
+            at most `half_blend_s`.
+    """
+
+    def __init__(
+        self, segment_s: float, half_blend_s: float, min_end_blend_half_s: float = 0.0
+    ) -> None:
         self.segment_s = segment_s
         self.half_blend_s = half_blend_s
-        self.least_s = least_s  # least half blend time in which it may slow down
-        # Half the time in which the speed falls at the end: at most the leg's own half blend time,
-        # and more than none.
+        self.least_s = min_end_blend_half_s
         self.leaving_s = half_blend_s
 
     @property
     def nominal_s(self) -> float:
-        """Time at which the goal would be reached at full speed: the middle of a blend into another
-        leg.
+        """Time at which the goal would be reached at full speed, s.
+
+        It is the middle of a blend into another leg.
         """
         return self.half_blend_s + self.segment_s
 
     @property
     def ends_s(self) -> float:
-        """Time at which the leg rests at its goal."""
+        """Time at which the leg comes to rest at its goal, s."""
         return self.nominal_s + self.leaving_s
 
     def part(self, time_s: float) -> float:
-        """Return the part done after `time_s`."""
+        """Return the progress after `time_s`, 0 to 1."""
         if time_s <= 0.0:
             return 0.0
-        left = self.ends_s - time_s
-        if left <= 0.0:
+        remaining_s = self.ends_s - time_s
+        if remaining_s <= 0.0:
             return 1.0
-        if left < 2.0 * self.leaving_s:
-            return 1.0 - _ramp(left, self.leaving_s) / self.segment_s
+        if remaining_s < 2.0 * self.leaving_s:
+            return 1.0 - _ramp(remaining_s, self.leaving_s) / self.segment_s
         half_s = self.half_blend_s
-        way = _ramp(time_s, half_s) if time_s < 2.0 * half_s else time_s - half_s
-        return way / self.segment_s
+        distance = _ramp(time_s, half_s) if time_s < 2.0 * half_s else time_s - half_s
+        return distance / self.segment_s
 
 
 def _ramp(time_s: float, half_s: float) -> float:
-    """Return the way after `time_s` of a smooth rise of speed from 0 to 1 over 2 `half_s`."""
+    """Return the distance covered `time_s` after the start of a smooth rise of speed.
+
+    The speed rises from 0 to 1 during twice `half_s`.
+    """
     h = time_s / (2.0 * half_s)
     return 2.0 * half_s * h * h * h * (1.0 - 0.5 * h)
 
@@ -204,12 +257,12 @@ class JointLeg:
         self.law = timed(times, np.abs(self._way), np.zeros(len(goal)), limits)
 
     def at(self, time_s: float) -> Array:
-        """Return joint positions (joints,), rad, `time_s` after the begin."""
+        """Return the joint positions `time_s` after the start, (joints,), rad."""
         return np.asarray(self._start + self.law.part(time_s) * self._way)
 
 
 class ToolLeg:
-    """A straight line of the tool that turns at a constant rate, to a goal that may move.
+    """A straight line of the tool with a constant rate of turn, to a goal that may move.
 
     Inverse kinematics stays on the branch of the start.
     """
@@ -222,7 +275,18 @@ class ToolLeg:
         ik: InverseKinematics,
         limits: Limits,
     ) -> None:
-        """Prepare the way from the joint positions `start`. Raises `Unfit`."""
+        """Solve the path at some poses and choose its time law.
+
+        Args:
+            start: Joint positions at the start, (joints,), rad.
+            goal: Goal of the tool.
+            times: Times that the request asks for.
+            ik: Inverse kinematics of the arm.
+            limits: Velocity and acceleration limits of the joints.
+
+        Raises:
+            InfeasibleMotion: If a pose of the path has no joint positions.
+        """
         self._ik = ik
         self._from = ik.tool_at(start)
         self._goal = goal
@@ -232,27 +296,40 @@ class ToolLeg:
         self.law = timed(times, speed, bend, limits)
 
     def at(self, time_s: float) -> Array:
-        """Return joint positions (joints,), rad, `time_s` after the begin. Raises `Unfit`."""
-        part = self.law.part(time_s)
-        self._last = self._solve(self._from.towards(self._goal.pose, part), self._last, part)
+        """Return the joint positions `time_s` after the start, (joints,), rad.
+
+        Raises:
+            InfeasibleMotion: If the pose has no joint positions.
+        """
+        progress = self.law.part(time_s)
+        self._last = self._solve(
+            self._from.towards(self._goal.pose, progress), self._last, progress
+        )
         return self._last
 
-    def _solve(self, pose: Pose, near: Array, part: float) -> Array:
-        found = self._ik.nearby(pose, near)
-        if found is None:
+    def _solve(self, pose: Pose, start: Array, share: float) -> Array:
+        """Return joint positions for a pose of the tool on the branch of `start`.
+
+        Raises `InfeasibleMotion` if there are none. Its text contains `share`, the completed
+        fraction of the path.
+        """
+        joints = self._ik.nearby(pose, start)
+        if joints is None:
             x, y, z = pose.position
             raise Unfit(
-                f"no joint positions for the tool at {x:.3f} {y:.3f} {z:.3f}, {part:.0%} of the way"
+                f"no joint positions for the tool at {x:.3f} {y:.3f} {z:.3f},"
+                f" {share:.0%} of the way"
             )
-        return found
+        return joints
 
     def _try_out(self, start: Array, goal: Pose) -> tuple[Array, Array]:
-        """Return the greatest first and second derivative of the joints by the part of the way,
-        (joints,) each.
+        """Return the largest first and second derivatives of the joints by the progress.
+
+        Both have shape (joints,) and are taken from a number of poses of the path.
         """
-        way = norm(goal.position - self._from.position)
+        distance = norm(goal.position - self._from.position)
         turn = self._from.angle_to(goal)
-        steps = min(max(ceil(way / STEP_M), ceil(turn / STEP_RAD), 4), MAX_STEPS)
+        steps = min(max(ceil(distance / STEP_M), ceil(turn / STEP_RAD), 4), MAX_STEPS)
         points = [start]
         for k in range(1, steps + 1):
             points.append(self._solve(self._from.towards(goal, k / steps), points[-1], k / steps))
@@ -262,46 +339,64 @@ class ToolLeg:
 
 
 Leg = JointLeg | ToolLeg
-"""One motion."""
+"""A single motion."""
 
 
-def timed(times: Times, speed: Array, bend: Array, limits: Limits) -> TimeLaw:
-    """Return the time law of a leg.
+def timed(times: Times, speed: Array, curvature: Array, limits: Limits) -> TimeLaw:
+    """Build the time law of a leg.
 
-    `speed` and `bend` are the first and second derivatives of joint positions by the part of the
-    way, (joints,) each. A segment time that is too short for a limit, or for two blends, is
-    stretched.
+    A segment time that is too short for a limit, or for two blends, is stretched.
+
+    Args:
+        times: Times that the request asks for.
+        speed: Largest first derivative of the joint positions by the progress, (joints,), rad.
+        curvature: Largest second derivative, (joints,), rad.
+        limits: Velocity and acceleration limits of the joints.
     """
-    half = times.half_blend
-    most = BLEND_PART * limits.acceleration
-    slope = PEAK * speed / half
-    needed = np.maximum(
-        speed / limits.velocity, (slope + np.sqrt(slope * slope + 4.0 * most * bend)) / (2.0 * most)
+    half_blend_s = times.half_blend
+    max_acceleration = BLEND_PART * limits.acceleration
+    slope = PEAK * speed / half_blend_s
+    needed_s = np.maximum(
+        speed / limits.velocity,
+        (slope + np.sqrt(slope * slope + 4.0 * max_acceleration * curvature))
+        / (2.0 * max_acceleration),
     )
-    segment = max(float(needed.max()), times.segment, 2.0 * half)
-    room = most - bend / (segment * segment)
-    return TimeLaw(segment, half, min(half, float((PEAK * speed / segment / room).max())))
+    segment_s = max(float(needed_s.max()), times.segment, 2.0 * half_blend_s)
+    spare_acceleration = max_acceleration - curvature / (segment_s * segment_s)
+    end_half_s = float((PEAK * speed / segment_s / spare_acceleration).max())
+    return TimeLaw(segment_s, half_blend_s, min(half_blend_s, end_half_s))
 
 
 class Settling:
-    """A ramp to rest of every joint by itself: matched position, velocity and acceleration, then
-    rest.
+    """Independent ramp of every joint to rest.
+
+    It starts with the given position, velocity and acceleration.
+
+    Attributes:
+        ends_s: Time at which the last joint rests, s.
+        end: Joint positions at rest, (joints,), rad.
     """
 
-    def __init__(self, state: tuple[Array, Array, Array], most: Array, least_s: float) -> None:
-        """Begin at `state`, rad, rad/s, rad/s2, within the accelerations `most`, in `least_s` or
-        more.
+    def __init__(
+        self, state: tuple[Array, Array, Array], max_acceleration: Array, min_duration_s: float
+    ) -> None:
+        """Compute the ramp of each joint.
+
+        Args:
+            state: Positions, velocities and accelerations at the start, rad, rad/s, rad/s2.
+            max_acceleration: Acceleration limits of the joints, (joints,), rad/s2.
+            min_duration_s: Shortest time of a ramp, s.
         """
         self._position, self._velocity, acceleration = state
-        # The peak is at most 1.5 |v| / T + |a| / 3, and |a| at the begin.
-        self._acceleration = np.clip(acceleration, -most, most)
-        room = most - np.abs(self._acceleration) / 3.0
-        self._time_s = np.maximum(1.5 * np.abs(self._velocity) / room, least_s)
+        # The peak acceleration is at most 1.5 |v| / T + |a| / 3 later, and |a| at the start.
+        self._acceleration = np.clip(acceleration, -max_acceleration, max_acceleration)
+        spare_acceleration = max_acceleration - np.abs(self._acceleration) / 3.0
+        self._time_s = np.maximum(1.5 * np.abs(self._velocity) / spare_acceleration, min_duration_s)
         self.ends_s = float(self._time_s.max())
-        self.end = self.at(self.ends_s)  # (joints,), rad: where the joints come to rest
+        self.end = self.at(self.ends_s)
 
     def at(self, time_s: float) -> Array:
-        """Return joint positions (joints,), rad, `time_s` after the begin."""
+        """Return the joint positions `time_s` after the start, (joints,), rad."""
         t = self._time_s
         h = np.minimum(time_s / t, 1.0)
         by_velocity = h - h * h * h * (1.0 - 0.5 * h)

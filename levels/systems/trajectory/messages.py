@@ -1,5 +1,6 @@
-"""Motion requests, which a planning level or a program queues, and the status of the level that
-does them.
+"""Motion requests, and the status of the level that carries them out.
+
+A planning level or a program queues the requests.
 """
 
 from __future__ import annotations
@@ -13,10 +14,12 @@ from rack.levels.messages import per_joint
 from rack.levels.operator import AnsweringStatus, RelayedCommand
 
 HELD = 16
-"""Motion requests that a trajectory level takes ahead: a CANCEL is seen at once while no more than
-these are open."""
+"""Number of motion requests that a trajectory level takes from the queue in advance.
+
+A CANCEL is seen at once while no more requests than this are open.
+"""
 ENDED = 8
-"""Ended requests that a status lists."""
+"""Number of ended requests that a status lists."""
 
 
 class MotionKind(IntEnum):
@@ -26,30 +29,31 @@ class MotionKind(IntEnum):
     JOINTS = 1  # a straight line in joint space, to joint positions
     POSE = 2  # a straight line of the tool, to a pose
     STAY = 3  # stay at the goal before it for `segment`
-    CANCEL = (
-        4  # end the request under way and drop all queued before this one; the arm ramps to rest
-    )
-    GRIP = 5  # bring the gripper to `opening` with at most `force`, at rest
-    # of a server of force and motion alone, like GUARD: see `rack.levels.systems.force.messages`
+    # End the request under way and drop all queued before this one. The arm ramps to rest.
+    CANCEL = 4
+    GRIP = 5  # move the gripper to `opening` with at most `force`, the arm at rest
+    # The last two are for a server of force and motion only, see
+    # `rack.levels.systems.force.messages`.
     COMPLY = 6
     GUARD = 7
 
 
 class RequestEnd(IntEnum):
-    """How a request ended."""
+    """Outcome of a request."""
 
     NONE = 0
     DONE = 1
     CANCELLED = 2
-    REFUSED = 3  # see the status' reason
-    FAILED = 4  # given up on the way
-    GUARDED = 5  # a guard was struck on the way
+    REFUSED = 3  # for the reason in the status
+    FAILED = 4  # abandoned while under way
+    GUARDED = 5  # ended by its guard
 
 
 class MotionRequest(RelayedCommand, version=1):
-    """`id` numbers requests, rising by one from 1 in the order of the queue; one not above those
-    taken
-    is a repetition.
+    """A motion for the trajectory level.
+
+    The `id` numbers requests consecutively from 1 in the order of the queue. A request whose id is
+    not above the newest one taken is a repetition.
     """
 
     kind: MotionKind = field(doc="what to do")
@@ -81,8 +85,9 @@ class MotionRequest(RelayedCommand, version=1):
 
 
 class MotionState(Message, version=1):
-    """What a restarted trajectory level needs, with its status, to neither repeat nor lose a
-    request.
+    """State that a restarted trajectory level needs in addition to its status.
+
+    With both it neither repeats nor loses a request.
     """
 
     begun: bool = field(doc="1: the first of `requests` is under way")

@@ -1,7 +1,8 @@
-"""The commanded motion as samples: the leg under way, plus what is left of the motion before it.
+"""The commanded motion as samples: the leg under way, plus the remainder of the previous motion.
 
-In every cycle the motion is evaluated once, one sample ahead. Velocity and acceleration of a sample
-are the differences of those around it, so they always fit the positions, however these come about.
+The motion is evaluated once per cycle, one sample ahead. Velocity and acceleration of a sample are
+finite differences of the neighbouring samples, and are therefore always consistent with the
+positions.
 """
 
 from __future__ import annotations
@@ -16,81 +17,97 @@ from rack.levels.robot.limits import Limits
 from rack.levels.systems.trajectory.legs import BLEND_PART, Leg, Settling, Unfit
 
 STOP_PART = 0.85
-"""Part of the acceleration limits that a stop takes: states are known by differences of samples
-only."""
+"""Fraction of the acceleration limits that a stop uses.
+
+The margin is needed because states are known only as differences of samples.
+"""
 LEAST_STOP_CYCLES = 5
-"""A joint that hardly moves takes so long to stop, for its acceleration to end smoothly."""
+"""Shortest stop, which lets the acceleration of a slow joint end smoothly."""
 EXCESS = 1.04
-"""Multiple of a limit that a sample may show, as from rounding of inverse kinematics; the planned
-velocity limits are 5 % below those of the arm."""
+"""Multiple of a limit that a sample may reach, for example by rounding of inverse kinematics.
+
+The planned velocity limits are 5 % lower than the limits of the arm.
+"""
 MAX_REST_RAD = 1e-7
-"""Samples that differ by less are the same."""
+"""Samples that differ by less than this are equal."""
 
 
 class SampledMotion:
-    """Begins legs, blends them, stops: without a step in position or velocity, within the limits of
-    every joint.
+    """Begins, blends and stops legs.
+
+    Position and velocity are continuous, and every joint stays within its limits.
+
+    Attributes:
+        leg: Leg under way or completed. None if the arm is stopping, or has stopped elsewhere.
+        time_s: Time of the present sample, s.
     """
 
     def __init__(
         self, limits: Limits, joints: tuple[str, ...], period_s: float, rest: Array
     ) -> None:
-        """Rest at the joint positions `rest`, (joints,), rad."""
+        """Start at rest.
+
+        Args:
+            limits: Velocity and acceleration limits of the joints.
+            joints: Names of the joints.
+            period_s: Time between samples, s.
+            rest: Joint positions at which the arm rests, (joints,), rad.
+        """
         self._limits = limits
         self._joints = joints
         self._period_s = period_s
-        # The leg under way or reached; None: the arm stops, or has stopped elsewhere.
         self.leg: Leg | None = None
         self._begun_s = 0.0
         self._settling: Settling | None = None
-        self._settles_s = 0.0  # when that began
+        self._settles_s = 0.0  # time at which the ramp began
         self.rest_at(rest)
 
     def rest_at(self, position: Array) -> None:
-        """Rest at joint positions (joints,), rad."""
+        """Rest at joint positions, (joints,), rad, and drop the leg."""
         self.leg = None
         self._settling = None
         self._rest = np.array(position)
-        self.time_s = 0.0  # of the present sample
-        self._samples = self._rest, self._rest, self._rest  # those before, at and after it
+        self.time_s = 0.0
+        # The samples before, at and after `time_s`.
+        self._samples = self._rest, self._rest, self._rest
 
     def advance(self, time_s: float) -> None:
-        """Go on to the sample at `time_s`, the next one. Raises `Unfit` with the arm ramping to
-        rest.
+        """Advance to the next sample, at `time_s`.
+
+        Raises:
+            InfeasibleMotion: If the motion cannot continue. The arm is then ramping to rest.
         """
         self.time_s = time_s
         _, velocity, acceleration = self.state
-        before, here = self._samples[1:]
-        self._samples = before, here, here
+        before, present = self._samples[1:]
+        self._samples = before, present, present
         try:
             self._look_ahead()
             if self.leg is not None:
                 self._check()
         except Unfit:
-            # The sample ahead cannot be made: go on from the state before this one.
+            # The next sample cannot be computed: ramp to rest from the previous state.
             velocity = velocity + self._period_s * acceleration
-            self._stop_from(JointSetPoint(here, velocity, acceleration))
+            self._stop_from(JointSetPoint(present, velocity, acceleration))
             raise
 
     @property
     def state(self) -> JointSetPoint:
-        """The present sample."""
-        before, here, after = self._samples
+        """Position, velocity and acceleration of the present sample."""
+        before, present, after = self._samples
         h = self._period_s
         return JointSetPoint(
-            here, (after - before) / (2.0 * h), (after - 2.0 * here + before) / (h * h)
+            present, (after - before) / (2.0 * h), (after - 2.0 * present + before) / (h * h)
         )
 
     @property
     def leg_s(self) -> float:
-        """Time since the leg began."""
+        """Time since the leg began, s."""
         return self.time_s - self._begun_s
 
     @property
     def settled(self) -> bool:
-        """Whether the leg, if there is one, has reached its goal, and nothing is left of the motion
-        before it.
-        """
+        """Whether the leg has reached its goal and the previous motion has decayed completely."""
         if self.leg is not None and self.leg_s < self.leg.law.ends_s:
             return False
         return self._settling is None or self.time_s - self._settles_s >= self._settling.ends_s
@@ -98,10 +115,10 @@ class SampledMotion:
     @property
     def resting(self) -> bool:
         """Whether the present sample is at rest."""
-        before, here, after = self._samples
+        before, present, after = self._samples
         return bool(
             (np.abs(after - before) < MAX_REST_RAD).all()
-            and (np.abs(after - here) < MAX_REST_RAD).all()
+            and (np.abs(after - present) < MAX_REST_RAD).all()
         )
 
     def stop(self) -> None:
@@ -114,10 +131,14 @@ class SampledMotion:
         self._look_ahead()
 
     def begin(self, make: Callable[[Array], Leg], half_blend_s: float) -> None:
-        """Begin the leg that `make` makes from where the motion so far ends, which slows down over
-        two half blends.
+        """Begin a leg while the motion so far slows down.
 
-        Raises `Unfit` with the arm ramping to rest.
+        Args:
+            make: Builds the leg from the joint positions at which the motion so far will end.
+            half_blend_s: Half the time in which the motion so far slows down, s.
+
+        Raises:
+            InfeasibleMotion: If `make` raises it. The arm is then ramping to rest.
         """
         if self.settled and self.leg is not None and not self.leg.live:
             self._rest = self._samples[1]
@@ -131,19 +152,26 @@ class SampledMotion:
         finally:
             self._look_ahead()
 
-    def _settle(self, state: JointSetPoint, part: float, least_s: float = 0.0) -> None:
+    def _settle(self, state: JointSetPoint, fraction: float, least_s: float = 0.0) -> None:
+        """Let the present motion decay to rest.
+
+        Args:
+            state: Sample from which the ramp starts.
+            fraction: Fraction of the acceleration limits to use.
+            least_s: Shortest time of the ramp, s.
+        """
         least_s = max(least_s, LEAST_STOP_CYCLES * self._period_s)
-        self._settling = Settling(state, part * self._limits.acceleration, least_s)
+        self._settling = Settling(state, fraction * self._limits.acceleration, least_s)
         self._settles_s = self.time_s
         self._rest = self._settling.end
 
     def _look_ahead(self) -> None:
-        """Evaluate the sample ahead anew, the motion having changed."""
-        before, here, _ = self._samples
-        self._samples = before, here, self._evaluate(self.time_s + self._period_s)
+        """Evaluate the next sample, again if the motion has changed."""
+        before, present, _ = self._samples
+        self._samples = before, present, self._evaluate(self.time_s + self._period_s)
 
     def _evaluate(self, time_s: float) -> Array:
-        """Return the joint positions at `time_s`. Raises `Unfit`."""
+        """Return the joint positions at `time_s`. Raises `InfeasibleMotion`."""
         position = self._rest if self.leg is None else self.leg.at(time_s - self._begun_s)
         settling = self._settling
         if settling is None or time_s - self._settles_s >= settling.ends_s:
@@ -151,20 +179,21 @@ class SampledMotion:
         return np.asarray(position + (settling.at(time_s - self._settles_s) - settling.end))
 
     def _check(self) -> None:
-        """Raise `Unfit` if the present sample exceeds a limit, as when a live goal is too fast for
-        the arm.
+        """Raise `InfeasibleMotion` if the present sample exceeds a limit.
+
+        This happens, for example, when a live goal is too fast for the arm.
         """
         _, velocity, acceleration = self.state
         for values, limits, unit in (
             (velocity, self._limits.velocity, "rad/s"),
             (acceleration, self._limits.acceleration, "rad/s2"),
         ):
-            # Written so that NaN is outside.
+            # The comparison is written such that NaN exceeds the limit.
             if not (np.abs(values) <= EXCESS * limits).all():
                 joint = int((np.abs(values) / limits).argmax())
                 name = self._joints[joint]
-                most = limits[joint]
+                limit = limits[joint]
                 raise Unfit(
                     f"joint '{name}' would need {abs(values[joint]):.2f} {unit}; permitted:"
-                    f" {most:.2f}"
+                    f" {limit:.2f}"
                 )

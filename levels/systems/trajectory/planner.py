@@ -1,9 +1,9 @@
-"""The planning level above a trajectory level: makes motion requests of a program, in `[task]`, in
-the background, and queues them.
+"""The planning level above a trajectory level, which queues motion requests for a program.
 
-RCCL's user program made its motion requests asynchronously [S3], and copied their parameters as it
-queued them: only live goals stay open [assumed]. So does the planner: its plan is the queue. The
-executor only says how far the program is.
+The program is in `[task]`. RCCL's user program made its motion requests asynchronously [S3], and
+copied their parameters when it queued them; only live goals could still change [assumed]. The
+planner does the same in the background, and its plan is the queue. The executor only reports the
+progress of the program.
 """
 
 from __future__ import annotations
@@ -50,29 +50,29 @@ class MotionStep(Table):
     """Base of the steps that move the arm."""
 
     segment: NotNegative = 0.0
-    """time of the segment, s; 0: from the limits; too short: stretched"""
+    """time of the segment, s; 0 chooses it from the limits, and too short a time is stretched"""
     acceleration: NotNegative = 0.0
-    """half the time of the blend into it, s; 0: the level's default"""
+    """half the time of the blend into the segment, s; 0 for the level's default"""
 
 
 class HomeStep(MotionStep):
-    """Move the joints to where the arm starts."""
+    """Move the joints to the arm's start position."""
 
     do: Literal["home"] = "home"
     """the kind of step"""
 
 
 class MoveStep(MotionStep):
-    """Move straight in joint space, to joint positions or to where the tool has a pose."""
+    """Move straight in joint space, to joint positions or to a pose of the tool."""
 
     do: Literal["move"] = "move"
     """the kind of step"""
     joints: tuple[Finite, ...] | None = None
     """joint positions, rad"""
     position: Vector | None = None
-    """of the tool, m"""
+    """position of the tool, m"""
     quaternion: Turn | None = None
-    """of the tool, as w, x, y, z; as at home when not given"""
+    """orientation of the tool, as w, x, y, z; by default as at home"""
 
     @model_validator(mode="after")
     def _one_goal(self) -> MoveStep:
@@ -84,20 +84,21 @@ class MoveStep(MotionStep):
 
 
 class LineStep(MotionStep):
-    """Move the tool along a straight line, to a pose in the world or in the frame of a body, which
-    it may follow.
+    """Move the tool along a straight line to a pose.
+
+    The pose is in the world or in the frame of a body, which it may follow.
     """
 
     do: Literal["line"] = "line"
     """the kind of step"""
     position: Vector
-    """of the tool, m, in the frame of `body`"""
+    """position of the tool, m, in the frame of `body`"""
     quaternion: Turn | None = None
-    """of the tool, as w, x, y, z, in that frame; as at home by default"""
+    """orientation of the tool in the same frame, as w, x, y, z; by default as at home"""
     body: str | None = None
-    """object or obstacle in whose frame the goal is; the world when not given"""
+    """object or obstacle in whose frame the goal is; by default the world"""
     live: bool = False
-    """true: the goal follows the body; false: it is copied when the motion begins"""
+    """whether the goal follows the body; otherwise its frame is copied when the motion begins"""
 
     @model_validator(mode="after")
     def _follows_a_body(self) -> LineStep:
@@ -109,49 +110,49 @@ class LineStep(MotionStep):
 
 
 class StayStep(Table):
-    """Stay at the goal before it; if that is live, follow it."""
+    """Stay at the previous goal, and follow it if it is live."""
 
     do: Literal["stay"] = "stay"
     """the kind of step"""
     seconds: Positive
-    """for how long, s"""
+    """duration, s"""
 
 
 class GripStep(Table):
-    """Bring the gripper to an opening, at rest."""
+    """Move the gripper to an opening, with the arm at rest."""
 
     do: Literal["grip"] = "grip"
     """the kind of step"""
     opening: Finite
     """gripper joint position, m or rad"""
     force: Positive | None = None
-    """largest force, N or N m; that of the gripper when not given"""
+    """largest force, N or N m; by default the gripper's force"""
     seconds: NotNegative = 0.0
-    """time that it takes, s; 0: the level's default"""
+    """time for the motion, s; 0 for the level's default"""
 
 
 class CancelStep(Table):
-    """Cancel what is under way or queued; the arm ramps to rest."""
+    """Cancel all requests under way or queued. The arm ramps to rest."""
 
     do: Literal["cancel"] = "cancel"
     """the kind of step"""
     after: NotNegative
-    """time after the step before it began, s"""
+    """time since the previous step began, s"""
 
 
 Step = MoveStep | LineStep | HomeStep | StayStep | GripStep | CancelStep
 
 
 class MotionProgram(Program):
-    """Steps in their order: step k becomes request k + 1."""
+    """Program of steps. Step k, counted from 0, becomes request k + 1."""
 
     step: tuple[Annotated[Step, Field(discriminator="do")], ...] = Field(
         (), max_length=MAX_REQUESTS
     )
-    """steps, done in their order"""
+    """steps, in the order of execution"""
 
     def misfits(self, robot: RobotConfig | None, scene: SceneConfig) -> Misfits:
-        """Yield key, value and reason of everything that the arm or the scene lacks."""
+        """Yield key, value and reason of every entry that does not suit the arm or the scene."""
         if robot is None:
             return
         for k, step in enumerate(self.step):
@@ -160,7 +161,7 @@ class MotionProgram(Program):
                 and step.joints is not None
                 and len(step.joints) != len(robot.joints)
             ):
-                why = f"{len(step.joints)} values; permitted: {len(robot.joints)}, one per joint"
+                why = f"has {len(step.joints)} values; must have {len(robot.joints)}, one per joint"
                 yield f"step[{k}].joints", list(step.joints), why
             if isinstance(step, LineStep) and step.body not in (None, *scene.bodies):
                 why = f"not in the scene; bodies: {', '.join(scene.bodies) or 'none'}"
@@ -170,22 +171,25 @@ class MotionProgram(Program):
 
 
 BATCH = 2
-"""Requests that one plan makes at most."""
+"""Largest number of requests made by one plan."""
 PATIENCE_S = 0.5
-"""Time after which a request that the level below does not report as taken is sent again: it may be
-lost."""
+"""Time after which a request that the level below has not taken is sent again, s.
+
+It may have been lost.
+"""
 
 
 class PlanningParams(Table):
-    """How far the planner goes ahead, in `[board.<name>.params]`."""
+    """`[board.<name>.params]`: how far the planner works ahead."""
 
     ahead: int = Field(4, ge=1, le=HELD)
-    """requests that may be queued or under way at the same time"""
+    """largest number of requests queued or under way at the same time"""
 
 
 class RequestExecutor(Executor):
-    """Reports the program done, or the error that ended it. It obeys no operator: the trajectory
-    level does.
+    """Reports the progress of the program and the error that ended it.
+
+    It obeys no operator, because the trajectory level does.
     """
 
     below = Input(MotionStatus, "below.status")
@@ -198,7 +202,7 @@ class RequestExecutor(Executor):
         self._count = len(self.program.read(context.task, context.robot, context.scene).step)
 
     def process(self, tick: int) -> None:
-        """Report the requests done."""
+        """Report how many requests are done, and the state of the level below."""
         below = self.below.message
         status = self.status
         status.echo = below.echo
@@ -218,12 +222,12 @@ class RequestExecutor(Executor):
 
 
 class RequestPlanner(Planner):
-    """Makes a request of each step of the program, a few ahead of the arm.
+    """Makes a request from each step of the program, a few steps ahead of the arm.
 
-    The request of step k has the id k + 1, so a restarted planner goes on after the newest one that
-    the level below has taken: a request sent twice is done once, and one that was lost is sent
-    again. A tool goal that it finds no joint positions for is queued as it stands: the level below
-    refuses it, with its reason.
+    The request of step k has the id k + 1. A restarted planner therefore continues after the newest
+    request that the level below has taken. A request that was sent twice is carried out once, and
+    one that was lost is sent again. If no joint positions are found for a tool goal, the request is
+    queued anyway: the level below refuses it with the reason.
     """
 
     below = Input(MotionStatus, "below.status")
@@ -241,16 +245,19 @@ class RequestPlanner(Planner):
         self._home = cell.home
         self._upright = self._ik.tool_at(cell.home).quaternion
         self._bodies = context.scene.bodies
-        # Joint positions (joints,), rad, at the end of each step planned.
+        # Joint positions at the end of each planned step, (joints,), rad.
         self._goals: dict[int, Array] = {}
         self._sent = 0  # newest request queued, or taken below
         self._taken = 0  # newest request taken below
-        self._taken_at = 0  # tick at which it or `_sent` changed
+        self._taken_at = 0  # tick at which `_taken` or `_sent` changed
         self._begun = 0  # newest request begun below
-        self._begun_at = 0  # tick at which it was seen
+        self._begun_at = 0  # tick at which `_begun` changed
 
     def wanted(self, tick: int) -> bool:
-        """Return whether a step may be planned now."""
+        """Return True if a step may be planned now.
+
+        Notes what the level below has taken and begun.
+        """
         below = self.below.message
         if not self.below.is_there or below.error:
             return False
@@ -269,7 +276,7 @@ class RequestPlanner(Planner):
         return self._may_send(below.done, tick)
 
     def plan(self, tick: int) -> None:
-        """Plan the next steps, and queue their requests."""
+        """Plan the next steps and queue their requests."""
         for _ in range(BATCH):
             if not self._may_send(self.below.message.done, tick):
                 return
@@ -280,6 +287,12 @@ class RequestPlanner(Planner):
             self._taken_at = tick
 
     def _may_send(self, done: int, tick: int) -> bool:
+        """Return True if the next step may be queued now.
+
+        Args:
+            done: Newest request ended by the level below.
+            tick: Present tick; a cancel step has a delay.
+        """
         sent = self._sent
         if sent >= len(self._steps) or sent - done >= self._ahead:
             return False
@@ -290,7 +303,7 @@ class RequestPlanner(Planner):
         return self._begun >= sent and begun_s >= step.after
 
     def _fill(self, request: MotionRequest, k: int, world: WorldState) -> None:
-        """Make a request of step k."""
+        """Fill in the request of step k."""
         step = self._steps[k]
         self._goals[k] = self._goal(k, world)
         request.clear()
@@ -325,8 +338,9 @@ class RequestPlanner(Planner):
             request.kind = MotionKind.CANCEL
 
     def _goal_before(self, k: int, world: WorldState) -> Array:
-        """Return joint positions at the end of the step before step k, planning it if need be, as
-        after a restart.
+        """Return the joint positions at the end of the step before step k.
+
+        The step is planned if necessary, for example after a restart.
         """
         if k == 0:
             return self._home
@@ -335,30 +349,37 @@ class RequestPlanner(Planner):
         return self._goals[k - 1]
 
     def _goal(self, k: int, world: WorldState) -> Array:
-        """Return joint positions at the end of step k; those before it where there are none."""
+        """Return the joint positions at the end of step k.
+
+        If the step does not move the arm, or no positions are found, the previous ones are
+        returned.
+        """
         step = self._steps[k]
-        before = self._goal_before(k, world)
+        previous = self._goal_before(k, world)
         if isinstance(step, HomeStep):
             return self._home
         if isinstance(step, MoveStep) and step.joints is not None:
             return np.array(step.joints)
         target = self._tool(step)
         if target is None:
-            return before
+            return previous
         if isinstance(step, LineStep) and step.body is not None:
             if not world.revision:
-                return before
+                return previous
             row = self._bodies.index(step.body)
             target = pose(world.position[row], world.quaternion[row]) @ target
-        found = self._ik.reach(target, before)
-        if found is not None:
-            return found
-        others = self._ik.reachable(target, before)
-        return others[0] if others else before
+        joints = self._ik.reach(target, previous)
+        if joints is not None:
+            return joints
+        solutions = self._ik.reachable(target, previous)
+        return solutions[0] if solutions else previous
 
     def _tool(self, step: Step) -> Pose | None:
-        """Return the pose of the tool that a step gives, in its frame; None: it gives none."""
+        """Return the pose of the tool at the goal of a step, in the step's frame.
+
+        None if the step gives no pose.
+        """
         if not isinstance(step, MoveStep | LineStep) or step.position is None:
             return None
-        turn = self._upright if step.quaternion is None else step.quaternion
-        return pose(step.position, turn)
+        quaternion = self._upright if step.quaternion is None else step.quaternion
+        return pose(step.position, quaternion)

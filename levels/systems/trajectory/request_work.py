@@ -1,4 +1,4 @@
-"""Does the requests of the agenda, sample by sample."""
+"""Execution of the requests on the agenda, sample by sample."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ class TrajectoryParams(Table):
     """Times of motions and of following, in `[board.<name>.params]`."""
 
     acceleration: Positive = 0.3
-    """half the time of a blend, where a request gives none, s"""
+    """half the time of a blend if a request gives none, s"""
     gripping: Positive = 0.6
-    """time of a GRIP, where a request gives none, s"""
+    """time of a GRIP if a request gives none, s"""
     follow: Positive = 0.25
     """time constant with which a live goal follows its body, s"""
     blind: Positive = 0.3
-    """time for which a body's motion is extrapolated, s"""
+    """longest time for which the motion of a body is extrapolated, s"""
     handover: int = Field(HANDOVER_CYCLES, ge=1, le=1000)
-    """cycles until statuses must show that the first set point is followed"""
+    """cycles after the first set point until statuses must show that it is followed"""
 
 
 class MotionTools(NamedTuple):
-    """What makes legs."""
+    """Models and parameters that are needed to build legs."""
 
     ik: InverseKinematics
     limits: Limits
@@ -52,56 +52,69 @@ class MotionTools(NamedTuple):
 
 
 class RequestWork:
-    """Begins, blends and ends requests; interrupted motion goes on from where the arm rests."""
+    """Begins, blends and ends requests.
+
+    Interrupted motion continues from where the arm has come to rest.
+
+    Attributes:
+        goal: Goal of the tool leg under way or completed. None for a leg in joint space.
+        passed_s: Time that the request under way has stayed or gripped, s.
+        grip: Opening, m, and force, N, of the last GRIP.
+    """
 
     def __init__(self, agenda: Agenda, motion: SampledMotion, tools: MotionTools) -> None:
         self.agenda = agenda
         self.motion = motion
         self._tools = tools
-        # Of the leg under way or reached; None: it is one in joint space.
         self.goal: ToolGoal | None = None
-        self.passed_s = 0.0  # time that the request under way has stayed or gripped
-        self.grip = 0.0, 0.0  # opening, m, and force, N, wanted by the last GRIP
-        self._interrupted = True  # motion must begin anew from rest
-        self._left = 1.0  # part of an interrupted leg's time that is left
+        self.passed_s = 0.0
+        self.grip = 0.0, 0.0
+        self._interrupted = True  # motion must start again from rest
+        self._left = 1.0  # fraction of an interrupted leg's time that remains
 
     def recall(self, passed_s: float, progress: float) -> None:
-        """Continue after a restart of the level."""
+        """Continue a request after a restart of the level.
+
+        Args:
+            passed_s: Time that the request had stayed or gripped, s.
+            progress: Fraction of its time that had passed.
+        """
         self.passed_s = passed_s
         self._left = 1.0 - progress
 
     def interrupt(self) -> None:
-        """Note that the arm was brought to rest elsewhere than at the goal."""
+        """Note that the arm has been brought to rest away from the goal."""
         if not self._interrupted:
             self._left = 1.0 - self.progress
         self._interrupted = True
         self.goal = None
 
     def cancel(self) -> None:
-        """Ramp to rest; no request is under way but a CANCEL."""
+        """Ramp to rest. The CANCEL is then the only request under way."""
         self._left = 1.0
         self._interrupted = False
         self.goal = None
         self.motion.stop()
 
     def end_guarded(self) -> None:
-        """End the request under way, GUARDED: the arm ramps to rest, and goes on from there with
-        the next one.
+        """End the request under way as GUARDED.
+
+        The arm ramps to rest, from where the next request continues.
         """
         self.agenda.end(RequestEnd.GUARDED)
-        self.agenda.goal = None  # the arm is not there
+        self.agenda.goal = None  # the arm has not reached it
         self.cancel()
 
     def step(self, time_s: float, hold: bool) -> None:
-        """Go on to the sample at `time_s`; with `hold`, ramp to rest."""
+        """Advance to the sample at `time_s`. With `hold`, ramp to rest and begin nothing."""
         motion = self.motion
         agenda = self.agenda
         try:
             if self.goal is not None:
                 self.goal.update(time_s + self._tools.period_s)
             motion.advance(time_s)
-        except Unfit as unfit:
-            self._fail(RequestEnd.FAILED, str(unfit), Error.LIMIT)
+        except Unfit as error:
+            self._fail(RequestEnd.FAILED, str(error), Error.LIMIT)
         if hold:
             if motion.leg is not None:
                 self.interrupt()
@@ -116,26 +129,33 @@ class RequestWork:
 
     @property
     def progress(self) -> float:
-        """Part of the time of the request under way that has passed, 0 to 1."""
+        """Fraction of the time of the request under way that has passed, 0 to 1."""
         current = self.agenda.current
         leg = self.motion.leg
         if current is None:
             return 0.0
         if current.kind not in MOTIONS:
-            lasts = self._lasts_s(current)
-            return min(self.passed_s / lasts, 1.0) if lasts > 0.0 else 1.0
+            duration_s = self._lasts_s(current)
+            return min(self.passed_s / duration_s, 1.0) if duration_s > 0.0 else 1.0
         if leg is None:
             return 1.0 - self._left
         return 1.0 - self._left * (1.0 - min(self.motion.leg_s / leg.law.ends_s, 1.0))
 
-    def _fail(self, how: RequestEnd, reason: str, code: Error) -> None:
-        self.agenda.fail(how, code, reason)
+    def _fail(self, outcome: RequestEnd, reason: str, code: Error) -> None:
+        """End the request under way with an error and cancel the others.
+
+        Args:
+            outcome: REFUSED or FAILED.
+            reason: Reason for the user.
+            code: Error code for the status.
+        """
+        self.agenda.fail(outcome, code, reason)
         self.goal = None
         self._left = 1.0
         self._interrupted = False
 
     def _go_on(self) -> None:
-        """Begin anew the motion that was interrupted, once the arm rests."""
+        """Resume an interrupted motion once the arm rests."""
         goal = self.agenda.goal
         current = self.agenda.current
         if not self.motion.settled:
@@ -150,6 +170,7 @@ class RequestWork:
             self._move(goal, 0.0, segment_s)
 
     def _is_done(self, current: MotionRequest) -> bool:
+        """Return True if a request has ended. Counts the time that it stays or grips."""
         if not self.motion.settled:
             return False
         if current.kind in MOTIONS or current.kind == MotionKind.CANCEL:
@@ -158,13 +179,15 @@ class RequestWork:
         return self.passed_s >= self._lasts_s(current)
 
     def _lasts_s(self, request: MotionRequest) -> float:
+        """Return the time that a request without motion lasts, s."""
         if request.kind == MotionKind.GRIP and not request.segment:
             return self._tools.params.gripping
         return request.segment
 
     def _consider(self, request: MotionRequest) -> None:
-        """Begin `request` if its time has come: nothing is under way, or the leg under way is to be
-        blended into it.
+        """Begin a request if it is due.
+
+        It is due when no other is under way, or when the leg under way must be blended into it.
         """
         current = self.agenda.current
         leg = self.motion.leg
@@ -179,23 +202,28 @@ class RequestWork:
                 self._begin(half_s)
 
     def _blend_s(self, leg: Leg, request: MotionRequest) -> float | None:
-        """Return half the time in which `leg` slows down, if now is the time to blend it into
-        `request`.
+        """Return half the time in which a leg slows down, if the blend into `request` is due now.
+
+        Returns:
+            The time, s. None while it is too early to blend.
         """
         law = leg.law
         passed_s = self.motion.leg_s
         if passed_s > law.ends_s - 2.0 * law.leaving_s:
-            return max(0.5 * (law.ends_s - passed_s), 0.0)  # it slows down already
+            # The leg is slowing down already.
+            return max(0.5 * (law.ends_s - passed_s), 0.0)
         wanted_s = max(request.acceleration or self._tools.params.acceleration, law.least_s)
         half_s = min(wanted_s, law.segment_s - law.half_blend_s)
         law.leaving_s = min(half_s, law.half_blend_s)
-        left_s = law.nominal_s - passed_s
-        return left_s if left_s < half_s + self._tools.period_s else None
+        remaining_s = law.nominal_s - passed_s
+        return remaining_s if remaining_s < half_s + self._tools.period_s else None
 
     def _can_begin(self, request: MotionRequest) -> bool:
+        """Return False while a goal in the frame of a body awaits the world model."""
         return request.kind not in MOTIONS or request.body < 0 or self._tools.sight.knows
 
     def _begin(self, half_s: float) -> None:
+        """Begin the next request, blended over twice `half_s`, s. An impossible one is refused."""
         request = self.agenda.begin()
         self.passed_s = 0.0
         self._left = 1.0
@@ -208,7 +236,7 @@ class RequestWork:
             self._start(request)
 
     def _misfit(self, request: MotionRequest) -> str:
-        """Return why a request cannot be done; empty: it may be possible."""
+        """Return why a request cannot be carried out. Empty if it may be possible."""
         tools = self._tools
         return misfit_of(request, tools.limits.position) or tools.sight.misfit(request.body)
 
@@ -218,8 +246,12 @@ class RequestWork:
             self.grip = request.opening, request.force
 
     def _move(self, request: MotionRequest, half_s: float, segment_s: float) -> None:
-        """Begin the leg to the goal of `request`; the motion so far slows down over twice
-        `half_s`.
+        """Begin the leg to the goal of a request. If none can be made, the request is refused.
+
+        Args:
+            request: Request of kind JOINTS or POSE.
+            half_s: Half the time in which the motion so far slows down, s.
+            segment_s: Time of the segment, s. 0 to choose it from the limits.
         """
         tools = self._tools
         half_blend_s = max(request.acceleration or tools.params.acceleration, half_s)
@@ -228,14 +260,14 @@ class RequestWork:
         if request.kind == MotionKind.POSE:
             goal = ToolGoal(request, tools.sight, tools.params.follow)
 
-        def make(start: Array) -> Leg:
+        def build_leg(start: Array) -> Leg:
             if goal is None:
                 return JointLeg(start, request.joints, times, tools.limits)
             goal.update(self.motion.time_s + tools.period_s)
             return ToolLeg(start, goal, times, tools.ik, tools.limits)
 
         try:
-            self.motion.begin(make, half_s)
+            self.motion.begin(build_leg, half_s)
             self.goal = goal
-        except Unfit as unfit:
-            self._fail(RequestEnd.REFUSED, str(unfit), Error.UNREACHABLE)
+        except Unfit as error:
+            self._fail(RequestEnd.REFUSED, str(error), Error.UNREACHABLE)

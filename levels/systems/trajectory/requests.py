@@ -1,4 +1,4 @@
-"""Motion requests as the trajectory level keeps them, from taking to end."""
+"""Storage of motion requests in the trajectory level, from their arrival to their end."""
 
 from __future__ import annotations
 
@@ -22,39 +22,45 @@ from rack.levels.systems.trajectory.messages import (
 )
 
 MOTIONS = (MotionKind.JOINTS, MotionKind.POSE)
-"""Kinds that may be blended into each other."""
+"""Kinds that move the arm, and can be blended into each other."""
 KINDS = range(MotionKind.JOINTS, MotionKind.GRIP + 1)
-"""Kinds that any trajectory level can do."""
+"""Kinds that every trajectory level can carry out."""
 
 
 def copy_request(record: Any) -> MotionRequest:
-    """Return a copy of the record of a request."""
+    """Copy the record of a request into a new message."""
     request = MotionRequest(record.dtype)
     request.record[...] = record
     return request
 
 
 def misfit_of(request: MotionRequest, ranges: Array) -> str:
-    """Return why no arm whose joints have `ranges`, (joints, 2), rad, could do a request; empty: it
-    may be possible.
+    """Return why no arm with these joint ranges can carry out a request.
+
+    Args:
+        request: Request to check.
+        ranges: Position limits of the joints, (joints, 2), rad.
+
+    Returns:
+        The reason. Empty if the request may be possible.
     """
     if request.kind not in KINDS:
         return f"kind {request.kind}; permitted: {KINDS[0]} to {KINDS[-1]}"
     times = request.acceleration, request.segment
     if not np.isfinite((*times, request.opening, request.force)).all() or min(times) < 0.0:
         return f"times {times[0]:g} and {times[1]:g} s; permitted: finite, 0 or more"
-    turn = request.quaternion
-    is_pose = np.isfinite((*request.position, *turn)).all() and turn.any()
+    quaternion = request.quaternion
+    is_pose = np.isfinite((*request.position, *quaternion)).all() and quaternion.any()
     if request.kind == MotionKind.POSE and not is_pose:
         return "the pose is not finite, or its quaternion is zero"
-    # Written so that NaN is one.
+    # Written such that NaN is refused.
     if not request.touch >= 0.0:
         return f"a guard of {request.touch:g} N m; permitted: 0 or more"
     if request.kind == MotionKind.JOINTS:
-        # Written so that NaN is outside.
-        outside = ~((request.joints >= ranges[:, 0]) & (request.joints <= ranges[:, 1]))
-        if outside.any():
-            joint = int(outside.argmax())
+        # Written such that NaN is outside.
+        is_outside = ~((request.joints >= ranges[:, 0]) & (request.joints <= ranges[:, 1]))
+        if is_outside.any():
+            joint = int(is_outside.argmax())
             low, high = ranges[joint]
             return (
                 f"joint {joint + 1} to {request.joints[joint]:g} rad; permitted: {low:.3f} to"
@@ -64,57 +70,66 @@ def misfit_of(request: MotionRequest, ranges: Array) -> str:
 
 
 class Agenda:
-    """Requests taken and not ended, oldest first, and how the last ones ended.
+    """The requests that were taken and have not ended, and how the last ones ended.
 
-    After an error all are dropped, and those that come are refused until a CANCEL. While one is
-    missing, those after it are left: the sender sees by `taken` where to begin again, or sends a
-    CANCEL.
+    After an error all requests are dropped, and new ones are refused until a CANCEL. While a
+    request of the sequence is missing, later ones are ignored. The sender sees in `taken` where to
+    continue, or sends a CANCEL.
+
+    Attributes:
+        held: Requests that have not ended, oldest first.
+        goal: Request at whose goal the arm is, or to which it moves. None if there is none.
+        taken: Newest request taken.
+        rests_on: Newest operator command on which a request rests.
+        error: Error that stopped the requests.
+        reason: Reason for the error.
     """
 
     def __init__(self) -> None:
         self.held: list[MotionRequest] = []
-        self.begun = False  # the first of them is under way
-        self.goal: MotionRequest | None = None  # at whose goal the arm is, or to which it goes
-        self.taken = 0  # newest id taken
-        self.rests_on = 0  # newest command of an operator on which a request taken rests
+        self.begun = False  # whether the first of them is under way
+        self.goal: MotionRequest | None = None
+        self.taken = 0
+        self.rests_on = 0
         self.error = Error.NONE
         self.reason = ""
-        # The request after `taken` was lost, with a board that died as it took it.
+        # Whether the request after `taken` was lost with a board that died while taking it.
         self.missing = False
         self._ended: deque[tuple[int, RequestEnd]] = deque(maxlen=ENDED)
 
     @property
     def current(self) -> MotionRequest | None:
-        """The request under way."""
+        """Request under way. None if there is none."""
         return self.held[0] if self.begun else None
 
     @property
     def next(self) -> MotionRequest | None:
-        """The request after that, or the first one."""
-        at = int(self.begun)
-        return self.held[at] if len(self.held) > at else None
+        """Request to begin next. None if there is none."""
+        index = int(self.begun)
+        return self.held[index] if len(self.held) > index else None
 
     @property
     def done(self) -> int:
-        """Newest request ended, however; 0: none yet."""
+        """Newest request that has ended in any way. 0 if none has."""
         return self._ended[0][0] if self._ended else 0
 
     @property
     def room(self) -> int:
-        """Requests that may be taken now."""
+        """Number of requests that may be taken now."""
         return HELD - len(self.held)
 
     def take(self, requests: Reading[MotionRequest]) -> bool:
-        """Take what is new; return whether the arm must stop: a CANCEL came."""
-        cancelled = False
+        """Take new requests. Returns True if a CANCEL was among them, and the arm must stop."""
+        is_cancelled = False
         if requests.is_new:
             for message in (*requests.earlier, requests.message):
-                cancelled |= self._take(copied(message))
-        return cancelled
+                is_cancelled |= self._take(copied(message))
+        return is_cancelled
 
     def _take(self, request: MotionRequest) -> bool:
-        # One sent again, by a planning level that was restarted or that misses it in the status, is
-        # not a new one.
+        """Take or ignore a request. Returns True for a CANCEL."""
+        # A planning level sends a request again after its own restart, or if the status does not
+        # show the request. Such a repetition is ignored.
         if request.id <= self.taken:
             return False
         if request.kind != MotionKind.CANCEL and self.taken and request.id != self.taken + 1:
@@ -138,7 +153,7 @@ class Agenda:
         return False
 
     def begin(self) -> MotionRequest:
-        """Begin the next request; the one under way is done."""
+        """Begin the next request. The one under way ends DONE."""
         if self.begun:
             self.end(RequestEnd.DONE)
         self.begun = True
@@ -147,32 +162,40 @@ class Agenda:
             self.goal = request
         return request
 
-    def end(self, how: RequestEnd) -> None:
-        """End the first request."""
-        self._end(self.held.pop(0), how)
+    def end(self, outcome: RequestEnd) -> None:
+        """End the first request with the given outcome."""
+        self._end(self.held.pop(0), outcome)
         self.begun = False
 
-    def fail(self, how: RequestEnd, code: Error, reason: str) -> None:
-        """End the first request so, drop the others, refuse those that come."""
+    def fail(self, outcome: RequestEnd, code: Error, reason: str) -> None:
+        """Fail the first request, cancel the others, and refuse new ones from now on.
+
+        Args:
+            outcome: REFUSED or FAILED.
+            code: Error code for the status.
+            reason: Reason for the user.
+        """
         self.error = code
         self.reason = reason
         self.goal = None
         if self.held:
             self.reason = f"request {self.held[0].id}: {reason}"
-            self.end(how)
+            self.end(outcome)
         self._drop_all()
 
     def _drop_all(self) -> None:
+        """End all requests as CANCELLED."""
         for request in self.held:
             self._end(request, RequestEnd.CANCELLED)
         self.held = []
         self.begun = False
 
-    def _end(self, request: MotionRequest, how: RequestEnd) -> None:
-        self._ended.appendleft((request.id, how))
+    def _end(self, request: MotionRequest, outcome: RequestEnd) -> None:
+        """Remember how a request ended."""
+        self._ended.appendleft((request.id, outcome))
 
     def report(self, status: MotionStatus) -> None:
-        """Fill the ids, the ends and the error of a `MotionStatus`."""
+        """Fill the ids, outcomes and error of a `MotionStatus`."""
         current = self.current
         status.taken = self.taken
         status.current = current.id if current is not None else 0
@@ -181,7 +204,7 @@ class Agenda:
             status.ended[k], status.ends[k] = ended
 
     def save(self, state: MotionState) -> None:
-        """Fill a `MotionState`."""
+        """Fill the open requests and the goal of a `MotionState`."""
         state.begun = self.begun
         state.count = len(self.held)
         for k, request in enumerate(self.held):
@@ -201,4 +224,4 @@ class Agenda:
         self.error = Error(status.error)
         self.reason = status.reason if status.error else ""
         ends = zip(status.ended.tolist(), status.ends.tolist(), strict=True)
-        self._ended.extend((request, RequestEnd(how)) for request, how in ends if request)
+        self._ended.extend((request, RequestEnd(outcome)) for request, outcome in ends if request)

@@ -1,4 +1,4 @@
-"""The level of the paper's figures 2 to 4: it computes for the given times."""
+"""The level of the paper's figures 2 to 4 consumes the given processor times."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ def test_an_executor_computes_for_its_time_in_every_cycle() -> None:
     times = [computing_ns(executor, tick) for tick in (0, 4, 8)]
     assert all(time >= 3 * MS for time in times)
     assert min(times) < 4 * MS
-    # Several times are taken by turns.
+    # Several times are repeated in order.
     executor = FigureExecutor(context(process_ms=[6.0, 1.0]))
-    # A cycle that is skipped takes its turn with it.
+    # A skipped cycle also skips its time.
     assert [computing_ns(executor, tick) >= 6 * MS for tick in (0, 4, 12, 16)] == [
         True,
         False,
@@ -70,6 +70,8 @@ def test_a_planner_computes_for_its_time_and_always_wants_a_plan() -> None:
         ({"proces_ms": 1.0}, "keys: process_ms, plan_ms"),
     ],
 )
-def test_a_time_that_is_none_is_refused_by_name(params: dict[str, Any], message: str) -> None:
+def test_an_invalid_time_is_refused_with_the_name_of_its_key(
+    params: dict[str, Any], message: str
+) -> None:
     with pytest.raises(LevelError, match=message):
         FigureExecutor(context(**params))

@@ -144,7 +144,7 @@ def test_a_static_schedule_is_a_table_of_its_distinct_frames() -> None:
 def test_verbose_shows_what_the_arm_does_while_no_torque_comes() -> None:
     words = ("nasrem", "--set", "robot.patience_ms=10")
     (line,) = (line for line in check(*words).stdout.splitlines() if line.startswith("patience: "))
-    assert "'servo' goes on with its last torque for 10 ms (4 cycles; permitted: 10.0 ms)" in line
+    assert "'servo' keeps its last torque for 10 ms (4 cycles; at most 10.0 ms)" in line
     assert "turn [19.2, 15.1, 24.0, 53.4, 50.9, 57.4] mrad, and all motors at full torque" in line
     (found,) = json.loads(check(*words, "--json").stdout)["patience"]
     assert [found[key] for key in ("board", "ms", "cycles", "energy_j")] == ["servo", 10, 4, 10.372]

@@ -1,4 +1,4 @@
-"""A rack of two levels with budgets, for the timing model: nothing of it is ever launched."""
+"""A rack of two levels with budgets for the timing model, which is never launched."""
 
 from __future__ import annotations
 
@@ -55,15 +55,17 @@ exchange_ms = 0.25
 plan_ms = 8.0
 update_ms = 0.5
 """
-"""Lower: R 10 ms, t_exec 3, t_comm 1.25, t_residual 5.75, t_plan 8.5 within 4 cycles: fits, and
-could within 2."""
+"""Lower: R 10 ms, t_exec 3, t_comm 1.25, t_residual 5.75, t_plan 8.5 within 4 cycles.
+
+It fits, even within 2 cycles.
+"""
 
 Judge = Callable[..., JudgedConfig]
 
 
 @pytest.fixture
 def budgeted(tmp_path: Path) -> Path:
-    """The rack as a file."""
+    """Write the rack to a file."""
     path = tmp_path / "budgeted.toml"
     path.write_text(BUDGETED)
     return path
@@ -71,7 +73,7 @@ def budgeted(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def judge(budgeted: Path) -> Judge:
-    """Put the rack, with settings, to the timing model."""
+    """Return a function that judges the rack with settings."""
 
     def judged(*settings: str) -> JudgedConfig:
         return JudgedConfig.of(load(budgeted, settings))

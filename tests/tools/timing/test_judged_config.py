@@ -1,5 +1,4 @@
-"""Verdicts: every equation with both sides, on levels, tasks and cores, against numbers worked out
-by hand."""
+"""Verdicts: both sides of every equation for levels, tasks and cores, as calculated by hand."""
 
 from __future__ import annotations
 
@@ -18,7 +17,7 @@ LOOSE = ("board.lower.coupling=loose", "board.lower.planner_slot=4", "board.lowe
 def sides(
     judged: JudgedConfig, equation: str, subject: str
 ) -> list[tuple[float, str, float, bool]]:
-    """Return both sides in ms, or as shares, of what an equation says of a subject."""
+    """Return both sides of an equation for a subject, in ms or as fractions."""
     found = [v for v in judged.verdicts if (v.equation, v.subject) == (equation, subject)]
     assert found, f"no {equation} of {subject}"
     scale = [MS if v.unit == "ns" else 1 for v in found]
@@ -34,7 +33,7 @@ SECOND = (
     " process_ms = 1 }"
 )
 JOINT = f"board.joint={{ slot = 9, core = 2, every = 16, {SECOND} }}"
-"""A board a joint: the second joint is slower than the level above."""
+"""Boards per joint, the second of which is slower than the level above."""
 UNEVEN = "board.lower={ rate_hz = 57.142857142857146 }"
 """8 and 7 ticks: 15, and 6 of waiting going down, 7 going up; twice the longest is 16."""
 GOAL = "timing.response_ms=35"
@@ -111,14 +110,13 @@ LATE_PLANS = {("response time", "lower.planner"), ("load", "core 1")}
         # C + U = 1.25 of 10.
         (("board.lower.budget.update_ms=1.0",), {("3.10", "lower")}),
         (("board.lower.budget.plan_within_ms=39",), {("plan within", "lower")}),
-        # 9 + 1.25 is more than the cycle, and leaves nothing to plan in.
+        # 9 + 1.25 is more than the cycle and leaves no time for planning.
         (
             ("board.lower.budget.process_ms=9",),
             {(one, "lower") for one in ("3.1", "3.5", "3.6", "3.8", "3.9", "response time")}
             | LATE_PLANS,
         ),
-        # The cycle is full to the brim: it fits, but a residual of 0 is none, and switches do not
-        # fit.
+        # The cycle is completely full. It fits, but the residual of 0 leaves no time for switches.
         (
             ("board.lower.budget.process_ms=8.75", "board.lower.planner_priority=0"),
             {(one, "lower") for one in ("3.6", "3.8", "3.9", "response time")} | LATE_PLANS,
@@ -126,7 +124,7 @@ LATE_PLANS = {("response time", "lower.planner"), ("load", "core 1")}
         (SHARED, {("response time", "lower.planner"), ("load", "core 0")}),
     ],
 )
-def test_what_does_not_fit_fails_by_its_equations_and_no_others(
+def test_a_rack_that_does_not_fit_fails_exactly_the_expected_equations(
     judge: Judge, settings: tuple[str, ...], expected: set[tuple[str, str]]
 ) -> None:
     assert failing(judge(*settings)) == expected
@@ -135,7 +133,7 @@ def test_what_does_not_fit_fails_by_its_equations_and_no_others(
 @pytest.mark.parametrize(
     "settings", [LOOSE, ("board.lower.budget.plan_ms=0", "board.lower.budget.update_ms=0")]
 )
-def test_equations_of_a_tight_planner_are_not_put_to_a_loose_or_unknown_one(
+def test_equations_of_a_tight_planner_do_not_apply_to_a_loose_or_unknown_one(
     judge: Judge, settings: tuple[str, ...]
 ) -> None:
     judged = judge(*settings)

@@ -1,4 +1,4 @@
-"""The response to an operator, measured to the tick."""
+"""The response to an operator, measured with the precision of a tick."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def config(rack_name: str, tmp_path: Path) -> MakeConfig:
     return lambda *settings: load(path, [f"name={rack_name}", *settings])
 
 
-def measured(config: RackConfig, folder: Path, *given: CommandConfig) -> OperatorResponse:
+def run_and_measure(config: RackConfig, folder: Path, *given: CommandConfig) -> OperatorResponse:
     response = response_of(record(with_commands(config, given), 1.0, folder).recording)
     assert response is not None
     return response
@@ -34,12 +34,12 @@ def measured(config: RackConfig, folder: Path, *given: CommandConfig) -> Operato
 
 @pytest.fixture(scope="module")
 def response(tmp_path_factory: pytest.TempPathFactory) -> OperatorResponse:
-    """The response of a run with three commands that are all acted on."""
+    """Return the response of a run with three commands that all take effect."""
     folder = tmp_path_factory.mktemp("responses")
     (folder / "told.toml").write_text(COMMANDED)
     given = [("upper", "hold", 101), ("upper", "resume", 176), ("lower", "hold", 250)]
     commands = [CommandConfig(level=level, what=what, tick=tick) for level, what, tick in given]
-    return measured(
+    return run_and_measure(
         load(folder / "told.toml", [f"name=test-response-{os.getpid()}"]), folder / "run", *commands
     )
 
@@ -61,15 +61,15 @@ def test_every_command_of_a_run_comes_at_its_predicted_tick(
 
 
 @pytest.mark.slow
-def test_what_no_torque_rests_on_is_told_apart(config: MakeConfig, tmp_path: Path) -> None:
+def test_commands_without_effect_have_distinct_fates(config: MakeConfig, tmp_path: Path) -> None:
     given = [
         CommandConfig(level="upper", what="goto", home=True, tick=50),
         CommandConfig(level="upper", what="hold", tick=101),
-        # It overtakes the one before on its way down.
+        # This command overtakes the previous one on its way down.
         CommandConfig(level="lower", what="hold", tick=105),
         CommandConfig(level="upper", what="resume", tick=398),
     ]
-    response = measured(config(), tmp_path / "run", *given)
+    response = run_and_measure(config(), tmp_path / "run", *given)
     assert [command.fate for command in response.commands] == [
         "refused",
         "superseded",
@@ -84,7 +84,9 @@ def test_what_no_torque_rests_on_is_told_apart(config: MakeConfig, tmp_path: Pat
 
 
 @pytest.mark.slow
-def test_a_response_off_its_tick_or_beyond_a_bound_is_seen(response: OperatorResponse) -> None:
+def test_a_response_at_another_tick_or_beyond_a_bound_is_detected(
+    response: OperatorResponse,
+) -> None:
     late = replace(response.commands[0], acts=113)
     assert not replace(response, commands=(late,)).held
     assert replace(response, commands=(late,)).off == [late]

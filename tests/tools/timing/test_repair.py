@@ -1,4 +1,4 @@
-"""Changes that make a rack fit: the smallest of each kind, tried and not assumed."""
+"""Changes that make a rack fit: the smallest of each kind, verified on the whole rack."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from rack.tools.timing.repair import changes_for, first_that, repair
 from tests.tools.timing.conftest import Judge
 
 
-def settings_for(judged: JudgedConfig, board: str = "lower") -> list[dict[str, object]]:
+def list_settings(judged: JudgedConfig, board: str = "lower") -> list[dict[str, object]]:
     return [change.settings for change in changes_for(judged, board)]
 
 
-def change_of(judged: JudgedConfig, key: str) -> Change:
+def find_change(judged: JudgedConfig, key: str) -> Change:
     """Return the first change for the lower board that sets `key`."""
     return next(change for change in changes_for(judged, "lower") if key in change.settings)
 
 
-def test_the_first_that_works_is_found_in_few_attempts() -> None:
+def test_the_first_item_that_works_is_found_in_few_attempts() -> None:
     attempts: list[int] = []
 
     def attempt(number: int) -> int | None:
@@ -87,8 +87,8 @@ def test_changes_are_the_smallest_of_each_kind_the_cheapest_first(
 ) -> None:
     monkeypatch.setattr("os.sched_getaffinity", lambda pid: set(range(cores)))
     judged = judge(*(f"board.lower.{setting}" for setting in lower), *others)
-    assert settings_for(judged)[: len(expected)] == expected
-    assert len(settings_for(judged)) == len(expected) or cores == 3
+    assert list_settings(judged)[: len(expected)] == expected
+    assert len(list_settings(judged)) == len(expected) or cores == 3
 
 
 def test_another_priority_costs_nothing_and_comes_first(judge: Judge) -> None:
@@ -112,46 +112,46 @@ def test_every_change_is_a_config_that_holds_by_itself(judge: Judge) -> None:
         assert not JudgedConfig.of(loads(change.after.config.text()), judged.budgets).failing
 
 
-def test_the_next_smaller_change_would_not_do(judge: Judge) -> None:
+def test_the_next_smaller_change_does_not_help(judge: Judge) -> None:
     judged = judge("board.lower.budget.plan_ms=60")
-    assert {"within_cycles": 11} in settings_for(judged)
+    assert {"within_cycles": 11} in list_settings(judged)
     assert judge("board.lower.budget.plan_ms=60", "board.lower.within_cycles=10").failing
     assert not judge("board.lower.budget.plan_ms=60", "board.lower.within_cycles=11").failing
 
 
 def test_a_critical_section_turns_into_a_time_slice_between_two_processors(judge: Judge) -> None:
     judged = judge("board.lower.within_cycles=1", "protocol.mailbox={ 'lower.plan' = 'lock' }")
-    loosened = change_of(judged, "coupling")
+    loosened = find_change(judged, "coupling")
     assert loosened.after.layout.mailbox("lower.plan").protocol == "time-slice"
     assert loosened.document()["protocols"] == {"lower.plan": "time-slice"}
     assert "lower.plan by time-slice" in loosened.text
 
 
-def test_a_longer_cycle_gives_a_plan_fewer_of_them_where_its_age_is_bounded() -> None:
+def test_a_longer_cycle_gives_a_plan_fewer_cycles_if_its_age_is_bounded() -> None:
     config = load("fig3")
     changes = changes_for(JudgedConfig.of(config), "level")
-    # The paper's own way out first, its figure 4; then its figure 2.
+    # The paper's remedies: its figure 4 first, then its figure 2.
     assert [change.settings for change in changes] == [
         {"coupling": "loose", "planner_slot": 3, "planner_core": 0},
         {"within_cycles": 2, "every": 4},
     ]
 
 
-def test_boards_are_mended_one_after_another(judge: Judge) -> None:
+def test_boards_are_repaired_one_after_another(judge: Judge) -> None:
     judged = judge("board.lower.within_cycles=1", "board.upper.budget.process_ms=19")
-    mended = repair(judged)
-    assert [changes[0].board for changes in mended.steps] == ["lower", "upper"]
-    assert mended.left == ()
-    assert mended.end.failing == ()
-    # The second step rests on the first.
-    assert mended.end.config.board["lower"].within_cycles == 2
-    assert [line.split(":")[0] for line in mended.lines() if not line.startswith(" ")] == [
+    repaired = repair(judged)
+    assert [changes[0].board for changes in repaired.steps] == ["lower", "upper"]
+    assert repaired.left == ()
+    assert repaired.end.failing == ()
+    # The second step builds on the first.
+    assert repaired.end.config.board["lower"].within_cycles == 2
+    assert [line.split(":")[0] for line in repaired.lines() if not line.startswith(" ")] == [
         "to make it fit, one of these, cheapest first",
         "then, with the first of these",
     ]
 
 
-def test_what_nothing_helps_against_is_said(judge: Judge) -> None:
+def test_a_failure_that_no_change_removes_is_named(judge: Judge) -> None:
     hopeless = repair(judge("board.lower.budget.process_ms=200"))
     assert hopeless.steps == ()
     assert {verdict.equation for verdict in hopeless.left} >= {"3.1", "3.4"}
@@ -159,7 +159,7 @@ def test_what_nothing_helps_against_is_said(judge: Judge) -> None:
     assert hopeless.document() == {"steps": [], "fits": False}
 
 
-def test_a_rack_that_fits_is_left_alone(judge: Judge) -> None:
+def test_a_rack_that_fits_needs_no_changes(judge: Judge) -> None:
     judged = judge()
     assert repair(judged).end is judged
     assert repair(judged).lines() == []
@@ -167,14 +167,14 @@ def test_a_rack_that_fits_is_left_alone(judge: Judge) -> None:
 
 @pytest.fixture(autouse=True)
 def two_cores(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Texts tell what this machine lacks: let every machine have two cores."""
+    """Simulate two cores, because texts name cores that the machine lacks."""
     monkeypatch.setattr("os.sched_getaffinity", lambda pid: {0, 1})
 
 
 def test_a_loose_planner_moves_to_another_core(judge: Judge) -> None:
     loose = ["coupling=loose", "planner_slot=4", "planner_core=0", "budget.plan_ms=31"]
-    # 8.4 of every 40 are the upper level's.
+    # The upper level takes 8.4 of every 40.
     judged = judge(*(f"board.lower.{setting}" for setting in loose))
-    assert {"planner_core": 2} in settings_for(judged)
+    assert {"planner_core": 2} in list_settings(judged)
     # The upper level could go instead, at no cost.
     assert changes_for(judged, "lower")[0].board == "upper"

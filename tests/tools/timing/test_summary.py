@@ -1,4 +1,4 @@
-"""The first lines of a check: what they say of a rack that fits, and of one that does not."""
+"""The first lines of a check, for a rack that fits and for one that does not."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ ALONE = ("--set", "board.lower.core=1", "--set", "board.lower.priority=80")
 MORE = "--verbose shows every task, mailbox and equation"
 
 
-def lines(*words: object, status: int = 0) -> list[str]:
-    """Return what a check prints."""
+def check_lines(*words: object, status: int = 0) -> list[str]:
+    """Return the lines that a check prints."""
     done = rack("check", *words)
     assert (done.returncode, done.stderr) == (status, "")
     return done.stdout.splitlines()
 
 
 @pytest.mark.slow
-def test_a_rack_that_fits_is_five_lines() -> None:
-    found = lines("nasrem")
+def test_the_summary_of_a_rack_that_fits_has_five_lines() -> None:
+    found = check_lines("nasrem")
     starts = ("rack nasrem: ", "fits: all ", "tightest: ", "response: ", "arm: ", "to do: nothing")
     assert [line[: len(start)] for line, start in zip(found, starts, strict=False)] == [*starts]
     assert found[3] == "response: a command down 1282.5 ms, a status up 2280 ms"
@@ -43,8 +43,8 @@ def test_a_rack_that_fits_is_five_lines() -> None:
     assert len(found) <= 8
 
 
-def test_a_rack_that_does_not_fit_shows_what_fails_and_what_helps(small: Path) -> None:
-    found = lines(small, "--set", FAILS, *ALONE, status=1)
+def test_a_rack_that_does_not_fit_shows_failures_and_helpful_changes(small: Path) -> None:
+    found = check_lines(small, "--set", FAILS, *ALONE, status=1)
     assert found[1].startswith("does not fit: 3 of ")
     assert found[2].endswith("% too much")
     failing = [line for line in found if "FAILS" in line]
@@ -54,19 +54,19 @@ def test_a_rack_that_does_not_fit_shows_what_fails_and_what_helps(small: Path) -
     assert found[-1] == MORE
 
 
-def test_whatever_was_not_counted_is_named_in_the_verdict(small: Path) -> None:
-    found = lines(small, "--set", BUDGET, *ALONE)
+def test_the_verdict_names_everything_that_was_not_counted(small: Path) -> None:
+    found = check_lines(small, "--set", BUDGET, *ALONE)
     clock = "'clock' (timing.clock_ms is 0; --set timing.clock_ms=0.1 counts 0.1 ms)"
     assert found[1].startswith(f"fits, without {clock}, 'upper' (no budget): measure it by: ")
     assert found[2].startswith("all ")
     assert "to do: nothing" not in found
     counted = ("--set", UPPER, "--set", "timing.clock_ms=0.01")
-    assert lines(small, "--set", BUDGET, *ALONE, *counted)[1].startswith("fits: all ")
-    left_out = lines(small, "--set", FAILS, *ALONE, status=1)[1]
+    assert check_lines(small, "--set", BUDGET, *ALONE, *counted)[1].startswith("fits: all ")
+    left_out = check_lines(small, "--set", FAILS, *ALONE, status=1)[1]
     assert f"equations and bounds fail; not counted: {clock}, 'upper' (no budget)" in left_out
 
 
-def test_the_document_tells_what_was_not_counted(small: Path) -> None:
+def test_the_document_names_everything_that_was_not_counted(small: Path) -> None:
     idle = BUDGET.replace("plan_ms = 2.0", "plan_ms = 0.0")
     for settings, fits, names in (
         ((BUDGET,), None, ["clock", "upper"]),
@@ -75,7 +75,7 @@ def test_the_document_tells_what_was_not_counted(small: Path) -> None:
         ((idle, UPPER), None, ["clock", "lower.planner"]),
     ):
         words = [word for setting in settings for word in ("--set", setting)]
-        printed = lines(small, *words, *ALONE, "--json", status=int(fits is False))
+        printed = check_lines(small, *words, *ALONE, "--json", status=int(fits is False))
         timing = json.loads("\n".join(printed))["timing"]
         assert (timing["fits"], list(timing["uncounted"])) == (fits, names)
 
@@ -93,20 +93,20 @@ def test_the_command_in_the_verdict_measures_what_was_missing(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     settings = ("--set", "clock.mode=lockstep", "--set", "timing.clock_ms=0.01")
-    command = lines(small, *settings)[1].partition("by: ")[2]
+    command = check_lines(small, *settings)[1].partition("by: ")[2]
     first, second = (shlex.split(part) for part in command.split("; "))
     assert rack(*first[1:]).returncode == 0
-    assert "no budget" not in "\n".join(lines(*second[2:]))
+    assert "no budget" not in "\n".join(check_lines(*second[2:]))
 
 
-def test_what_never_ends_is_told_in_a_sentence(small: Path) -> None:
+def test_a_planner_that_never_finishes_is_described_in_a_sentence(small: Path) -> None:
     overload = "board.lower.budget={ process_ms = 2.0, plan_ms = 1e6 }"
-    found = lines(small, "--set", overload, *ALONE, "--verbose", status=1)
+    found = check_lines(small, "--set", overload, *ALONE, "--verbose", status=1)
     assert found[2].startswith("tightest: planner 'lower.planner' never finishes: core 1 is over")
     assert not [line for line in found if re.search(r"\binf\b|inf%", line)]
 
 
-def test_interrupts_that_never_end_are_told_in_a_sentence() -> None:
+def test_interrupts_that_never_end_are_described_in_a_sentence() -> None:
     inbox = InboxTiming("low", ("up.status",), (InterruptSource(1_000, 2_000),), 4)
     timing = replace(JudgedConfig.of(load("fig2")).timing, inboxes={"low": inbox})
     (found,) = [verdict for verdict in verdicts(timing) if verdict.equation == INBOX]

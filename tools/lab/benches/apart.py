@@ -1,7 +1,7 @@
-"""Work in a process of its own, in the environment of boards.
+"""Computation in a separate process with the environment of boards.
 
-That environment makes results equal on every processor. It takes effect only when a process starts,
-so the same computation done in the process of a command may differ from a board's in the last bit.
+This environment makes results equal on every processor. It takes effect only when a process starts.
+The same computation in the process of a command may therefore differ in the last bit.
 """
 
 from __future__ import annotations
@@ -21,31 +21,37 @@ _R = TypeVar("_R")
 
 
 def apart(work: Callable[_P, _R], *args: _P.args, **kwargs: _P.kwargs) -> _R:
-    """Return what `work` returns, called in such a process; it must be a function of a module, its
-    values plain data.
+    """Call a function in a new process with the environment of boards.
+
+    Args:
+        work: Function of a module. Arguments and result must be plain data.
+        args: Positional arguments.
+        kwargs: Keyword arguments.
+
+    Returns:
+        The result of `work`.
 
     Raises:
         Failure: If the process ends without an answer.
-        Exception: What `work` raises.
+        Exception: Any exception that `work` raises.
     """
     spawn = multiprocessing.get_context("spawn")
-    ours, theirs = spawn.Pipe()
-    call = (theirs, os.getpid(), work, args, kwargs)
+    own_end, other_end = spawn.Pipe()
+    call = (other_end, os.getpid(), work, args, kwargs)
     process = spawn.Process(target=_work, args=call, daemon=True)
-    own = dict(os.environ)
+    saved_environment = dict(os.environ)
     os.environ.update(environment())
     try:
         process.start()
     finally:
         os.environ.clear()
-        os.environ.update(own)
-    theirs.close()
+        os.environ.update(saved_environment)
+    other_end.close()
     try:
-        answer, error = ours.recv()
+        answer, error = own_end.recv()
     except EOFError:
         process.join()
-        why = f"the process that measures ended with status {process.exitcode}"
-        raise Failure(why) from None
+        raise Failure(f"the process that measures ended with status {process.exitcode}") from None
     finally:
         process.kill()
         process.join()
@@ -58,6 +64,7 @@ def apart(work: Callable[_P, _R], *args: _P.args, **kwargs: _P.kwargs) -> _R:
 def _work(
     pipe: Connection, parent: int, work: Callable[..., Any], args: Any, kwargs: dict[str, Any]
 ) -> None:
+    """Call the function in the new process, and send the result or the exception."""
     die_with_parent(parent)
     try:
         pipe.send((work(*args, **kwargs), None))

@@ -1,5 +1,6 @@
-"""A rack of empty boards, on all cores in turn: the first sends a message in every cycle, each
-other passes it on.
+"""A rack of empty boards that pass a message along, distributed over all cores.
+
+The first board sends a message in every cycle, and each other one passes it on.
 """
 
 from __future__ import annotations
@@ -12,14 +13,15 @@ from rack.boards.config.schema import CLOCK_SLOT, Mode
 from rack.boards.config.toml import to_toml
 from rack.tools.lab.benches import relay
 
+# SCHED_FIFO priorities, as in the bundled configs.
 CLOCK_PRIORITY = 90
 PRIORITY = 80
-"""SCHED_FIFO priorities, as in the bundled configs."""
 
 
 class Chain(NamedTuple):
-    """`boards` boards at the clock's `rate_hz`; the first is on the last core, the clock on the
-    first.
+    """A rack of `boards` boards at the clock's `rate_hz`.
+
+    The clock is on the first core. The boards begin at the last core.
     """
 
     boards: int
@@ -29,11 +31,11 @@ class Chain(NamedTuple):
 
     @property
     def names(self) -> list[str]:
-        """The boards, in the order of the message."""
+        """Names of the boards, in the order in which they pass the message."""
         return [f"board{number}" for number in range(1, self.boards + 1)]
 
     def text(self) -> str:
-        """Return the rack's config."""
+        """Format the config of the rack as TOML."""
         cores = sorted(os.sched_getaffinity(0))
         boards: dict[str, Any] = {}
         for number, name in enumerate(self.names):

@@ -1,8 +1,7 @@
-"""The `rack` command line of this tree and of another checkout, so that a bench can run both by
-turns.
+"""The `rack` command of this tree and of another checkout, to run both alternately in a bench.
 
-A checkout runs in its own environment, TREE/.venv, which `make run` in it has made: in its packages
-and its libraries.
+A checkout runs in its own environment, TREE/.venv, with its own packages and libraries. `make run`
+in the checkout creates this environment.
 """
 
 from __future__ import annotations
@@ -25,14 +24,17 @@ WHERE = (
 WHERE_S = 30.0
 ENV = ".venv/installed"
 SOURCES = ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV")
-"""Variables by which a process would get modules of this environment."""
+"""Environment variables through which a process would find modules of this environment."""
 
 
 @dataclass(frozen=True)
 class RackCommand:
-    """A command line: `argv` goes before the arguments, `environment` is all of its environment.
+    """The `rack` command of one tree.
 
-    `name` says whose it is.
+    Attributes:
+        name: Name of the tree.
+        argv: Program and arguments that precede the arguments of `rack`.
+        environment: All environment variables of the command.
     """
 
     name: str
@@ -40,45 +42,54 @@ class RackCommand:
     environment: Mapping[str, str] = field(default_factory=os.environ.copy)
 
     def run(self, *arguments: object, bound_s: float) -> str:
-        """Run a command to its end; return its stdout.
+        """Run a command to its end and return its stdout.
 
-        Raises `Failure` with the last line of its stderr if it fails, and as `finished`.
+        Args:
+            arguments: Arguments of `rack`.
+            bound_s: Longest permitted time, s.
+
+        Raises:
+            Failure: If it fails or takes too long. The text contains the last line of its stderr.
         """
-        called = f"{self.name}: rack {' '.join(map(str, arguments[:2]))}"
+        label = f"{self.name}: rack {' '.join(map(str, arguments[:2]))}"
         argv = [*self.argv, *map(str, arguments)]
-        done = finished(called, argv, bound_s, self.environment)
-        if done.returncode:
-            lines = [line for line in done.stderr.splitlines() if line.strip()]
-            said = lines or [f"exit status {done.returncode}"]
-            raise Failure(f"{called}: {said[-1]}")
-        return done.stdout
+        completed = finished(label, argv, bound_s, self.environment)
+        if completed.returncode:
+            lines = filter(str.strip, completed.stderr.splitlines())
+            messages = [f"exit status {completed.returncode}", *lines]
+            raise Failure(f"{label}: {messages[-1]}")
+        return completed.stdout
 
 
 def rack_commands(against: Path | None) -> list[RackCommand]:
-    """Return the command line of this tree, and after it that of the checkout `against`, if there
-    is one. Raises `Failure`.
+    """Return the command of this tree, followed by the command of `against` if it is given.
+
+    Raises:
+        Failure: If `against` is not a usable checkout.
     """
     this = RackCommand(THIS, (sys.executable, "-c", RUN))
     return [this] if against is None else [this, checkout(against)]
 
 
 def checkout(tree: Path) -> RackCommand:
-    """Return the command line of another checkout.
+    """Return the command of another checkout.
 
-    Raises `Failure` if `tree` is not a checkout of rack, or has no environment.
+    Raises:
+        Failure: If `tree` is not a checkout of rack, or has no environment that runs it.
     """
     if not (tree / "tools" / "cli.py").is_file():
-        raise Failure(f"{tree}: not a checkout of rack: it has no tools/cli.py", 2)
+        raise Failure(f"{tree}: is not a checkout of rack: it has no tools/cli.py", 2)
     python = tree.resolve() / ".venv" / "bin" / "python"
     if not python.is_file():
-        raise Failure(f"{tree}: no environment .venv; to make it: make -C {tree} {ENV}", 2)
-    # The folder that a command starts in may be another tree: it must not come first.
-    own = {name: value for name, value in os.environ.items() if name not in SOURCES}
-    environment = {**own, "PYTHONSAFEPATH": "1"}
-    place = RackCommand(tree.resolve().name, (str(python), "-c", WHERE), environment)
-    # A copied environment runs the tree that it was copied from.
-    if (found := Path(place.run(bound_s=WHERE_S).strip())) != tree.resolve():
+        raise Failure(f"{tree}: has no environment .venv; to create it: make -C {tree} {ENV}", 2)
+    # The working directory may be another tree. Safe path keeps it from being searched first.
+    inherited = {name: value for name, value in os.environ.items() if name not in SOURCES}
+    environment = {**inherited, "PYTHONSAFEPATH": "1"}
+    locate = RackCommand(tree.resolve().name, (str(python), "-c", WHERE), environment)
+    # A copied environment still runs the tree from which it was copied.
+    if (actual := Path(locate.run(bound_s=WHERE_S).strip())) != tree.resolve():
         raise Failure(
-            f"{tree}: its .venv is that of {found}; to make its own: make -C {tree} clean {ENV}", 2
+            f"{tree}: its .venv belongs to {actual}; to renew it: make -C {tree} clean {ENV}",
+            2,
         )
-    return replace(place, argv=(str(python), "-c", RUN))
+    return replace(locate, argv=(str(python), "-c", RUN))

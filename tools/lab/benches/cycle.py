@@ -1,10 +1,9 @@
-"""The processor time of a board's cycle, by part: racks that run in real time and in lockstep, and
-their traces.
+"""The processor time of a board's cycle, by part, in real time and in lockstep.
 
-Reading, processing and writing lie between stamps of the trace; what the processor time of a cycle
-exceeds them by is waking up before it, and the bookkeeping after it. An empty board shows the
-rack's own cost; the physics that are in a servo cycle are replayed alone. Another checkout of rack
-runs the same racks by turns.
+The traces of runs give the times of reading, processing and writing. The rest of a cycle's
+processor time is spent on waking up before it and on bookkeeping after it. Empty boards show the
+cost of the rack itself. The physics of a servo cycle are also replayed without the rack. Another
+checkout of rack can run the same racks alternately with this one.
 """
 
 from __future__ import annotations
@@ -31,25 +30,28 @@ from rack.tools.recording.cycles import Cycles, cycles_of
 from rack.tools.recording.recording import Recording
 
 PARTS = ("wake", "read", "process", "write", "bookkeeping")
-"""Parts of a cycle, in the order of time."""
+"""Parts of a cycle in chronological order."""
 EMPTY = "empty"
 RATE_HZ = 400
 BOARDS = 6
-"""Boards of the empty rack: those of four levels, a world model and a loose planner."""
+"""Number of boards in the empty rack, enough for four levels, a world model and a planner."""
 LAUNCH_S = 5.0
-"""About how long launching a rack, and reporting on it, take in addition to its time."""
+"""Approximate time for launch and report, in addition to the time of a run, s."""
 BOUND_S = 120.0
-"""Longest time for a run, in addition to ten times its simulated time."""
+"""Longest time for a run, in addition to ten times its simulated time, s."""
 REPLAYED_TICKS = 1000
-"""Ticks of one replay of physics, at most."""
+"""Maximum number of ticks in one replay of the physics."""
 PHYSICS = "mj_step alone"
 COMPARED = f"{SERVO}, lockstep"
-"""The case that is compared with its physics."""
+"""Case in which the cycle is compared with its physics."""
 
 
 class CycleRun(NamedTuple):
-    """The cycles of a run by executor, and the processor time of each tick's bare physics, us;
-    empty unless they were replayed.
+    """The cycles of one run.
+
+    Attributes:
+        cycles: Cycles of each executor, by board.
+        physics_us: Processor time of each replayed tick of physics, us. Empty without a replay.
     """
 
     cycles: dict[str, Cycles]
@@ -57,7 +59,7 @@ class CycleRun(NamedTuple):
 
 
 class RackKind(NamedTuple):
-    """A rack to run, "nasrem" or "empty", in one mode."""
+    """A rack to run, "nasrem" or "empty", and its clock mode."""
 
     config: str
     mode: str
@@ -70,24 +72,26 @@ KINDS = tuple(
 
 @dataclass(frozen=True)
 class CycleCosts(Comparison):
-    """A comparison of whole cycles, and the medians of the parts of each by case and contestant,
-    us.
+    """Comparison of whole cycles, with the parts of each.
+
+    Attributes:
+        parts: Median processor time of each part, us, by case and contestant.
     """
 
     parts: Mapping[tuple[str, str], Mapping[str, float]] = field(default_factory=dict)
 
     def document(self) -> dict[str, Any]:
-        """Return everything as plain data."""
-        parts = [{"case": case, "who": who, **one} for (case, who), one in self.parts.items()]
+        """Convert the comparison and the parts to plain data."""
+        parts = [{"case": case, "who": who, **us} for (case, who), us in self.parts.items()]
         return {**super().document(), "parts_unit": "us", "parts": parts}
 
     def blocks(self) -> Blocks:
-        """Yield both tables for people."""
+        """Yield both tables for the terminal."""
         yield "Parts of a board's cycle, processor time, us, median"
         yield TextTable(
             [
-                {"board": board, "who": who, **{part: shown(one[part]) for part in PARTS}}
-                for (board, who), one in self.parts.items()
+                {"board": board, "who": who, **{part: shown(medians[part]) for part in PARTS}}
+                for (board, who), medians in self.parts.items()
             ]
         )
         yield ""
@@ -97,14 +101,17 @@ class CycleCosts(Comparison):
 def measure(
     against: Path | None, seconds: float, rounds: int, progress: Progress, share: bool = False
 ) -> CycleCosts:
-    """Run every rack of this tree, and of another checkout, by turns.
+    """Run every rack of this tree and of another checkout alternately.
 
     Args:
-        against: The other checkout; None if there is none.
-        seconds: Simulated time of each run.
-        rounds: Runs of each rack.
-        progress: Told of each run.
-        share: Run even on cores that another rack's real-time boards hold.
+        against: The other checkout. None if there is none.
+        seconds: Simulated time of each run, s.
+        rounds: Number of runs of each rack.
+        progress: Shows each run.
+        share: Whether to run even on cores that another rack's real-time boards hold.
+
+    Returns:
+        Costs of all cycles.
 
     Raises:
         Failure: If a run fails.
@@ -117,23 +124,24 @@ def measure(
             for kind in KINDS
             for command in commands
         }
-        found = interleaved(contestants, rounds, progress, seconds + LAUNCH_S)
+        runs_by_contestant = interleaved(contestants, rounds, progress, seconds + LAUNCH_S)
     cycles: defaultdict[tuple[str, str], list[Cycles]] = defaultdict(list)
     physics_us: list[float] = []
-    for (kind, who), runs in found.items():
+    for (kind, who), runs in runs_by_contestant.items():
         for run in runs:
             physics_us += run.physics_us
-            for board, own in run.cycles.items():
+            for board, board_cycles in run.cycles.items():
                 name = EMPTY if kind.config == EMPTY else board
-                cycles[f"{name}, {kind.mode}", who].append(own)
+                cycles[f"{name}, {kind.mode}", who].append(board_cycles)
     return costs(cycles, physics_us, commands[-1].name if against else None)
 
 
 def _run(
     kind: RackKind, command: RackCommand, seconds: float, scratch: str, share: bool
 ) -> CycleRun:
-    """Run one rack and take its cycles; of this tree's arm in lockstep, replay the physics at
-    once.
+    """Run one rack and return its cycles.
+
+    For this tree's arm in lockstep, the physics are replayed directly afterwards.
     """
     folder = Path(mkdtemp(dir=scratch))
     lockstep = kind.mode == "lockstep"
@@ -142,60 +150,64 @@ def _run(
         path = folder / "empty.toml"
         path.write_text(Chain(BOARDS, RATE_HZ).text())
         config = str(path)
-    # What is measured is the cost of a cycle, not whether all cycles came in time.
+    # Missed cycles must not fail the run: the bench measures only what a cycle costs.
     settings = (f"name=bench-{os.getpid()}", "supervision.max_missed_fraction=1")
     options = [*(f"--set={setting}" for setting in settings), "--seconds", seconds]
     options += ["--lockstep"] * lockstep + ["--share"] * share
     options += ["--out", folder / "run"]
     command.run("run", config, *options, bound_s=BOUND_S + 10.0 * seconds)
-    found = cycles_of(Recording(folder / "run"))
-    cycles = {name: own for name, own in found.items() if own.task.role == "executor"}
+    all_cycles = cycles_of(Recording(folder / "run"))
+    cycles = {name: each for name, each in all_cycles.items() if each.task.role == "executor"}
     if not lockstep or kind.config == EMPTY or command.name != THIS:
         return CycleRun(cycles, [])
     return CycleRun(cycles, apart(replay, folder / "run", REPLAYED_TICKS))
 
 
 def costs(
-    cycles: Mapping[tuple[str, str], list[Cycles]], physics_us: list[float], other: str | None
+    cycles: Mapping[tuple[str, str], list[Cycles]], physics_us: list[float], baseline: str | None
 ) -> CycleCosts:
-    """Return the costs of everything measured.
+    """Compute the costs of all measured cycles.
 
     Args:
         cycles: Cycles of all runs, by case and contestant.
-        physics_us: Processor time of ticks of bare physics.
-        other: The checkout with which this one is compared; without one, the servo level's cycle is
-            compared with its physics.
+        physics_us: Processor time of ticks of bare physics, us.
+        baseline: Name of the checkout with which this one is compared. None to compare the servo
+            level's cycle with its physics.
     """
     cases = list(dict.fromkeys(case for case, _ in cycles))
     samples = []
     parts = {}
-    # The contestants of a case stand together.
-    for one in sorted(cycles, key=lambda one: cases.index(one[0])):
-        judged_ns = [own.rows["processor_ns"][own.is_judged] for own in cycles[one]]
-        samples.append(Sample(*one, tuple((np.concatenate(judged_ns) * 1e-3).tolist()), "us"))
-        each = [parts_of(own) for own in cycles[one]]
-        medians = {part: np.concatenate([found[part] for found in each]) for part in PARTS}
-        # A single cycle has no parts: the record of the next one has its bookkeeping.
+    # Keep the contestants of a case together.
+    for key in sorted(cycles, key=lambda key: cases.index(key[0])):
+        judged_ns = [run.rows["processor_ns"][run.is_judged] for run in cycles[key]]
+        samples.append(Sample(*key, tuple((np.concatenate(judged_ns) * 1e-3).tolist()), "us"))
+        run_parts = [parts_of(run) for run in cycles[key]]
+        medians = {part: np.concatenate([us[part] for us in run_parts]) for part in PARTS}
+        # The bookkeeping of a cycle is in the next record, so a single cycle has no parts.
         if len(medians[PARTS[0]]):
-            parts[one] = {part: float(np.median(times_us)) for part, times_us in medians.items()}
+            parts[key] = {part: float(np.median(times_us)) for part, times_us in medians.items()}
     if physics_us:
         samples.append(Sample(COMPARED, PHYSICS, tuple(physics_us), "us"))
-    baselines = {COMPARED: PHYSICS} if other is None else dict.fromkeys(cases, other)
-    title = "Processor time of a board's cycle"
-    return CycleCosts("cycle", title, tuple(samples), baselines, parts=parts)
+    baselines = {COMPARED: PHYSICS} if baseline is None else dict.fromkeys(cases, baseline)
+    return CycleCosts(
+        "cycle", "Processor time of a board's cycle", tuple(samples), baselines, parts=parts
+    )
 
 
 def parts_of(cycles: Cycles) -> dict[str, np.ndarray]:
-    """Return the processor time of each part of each judged cycle but the first, us, shape (n,)."""
+    """Return the processor time of each part of the judged cycles, us, shape (n,).
+
+    The first cycle is left out.
+    """
     rows = cycles.rows
-    beyond = (rows["processor_ns"] - cycles.used_ns)[1:]
-    # A record counts, and stamps, the bookkeeping of the cycle before: its own is not done when it
-    # is written.
-    closing = rows["closed_ns"][1:] - rows["end_ns"][:-1]
+    rest_ns = (rows["processor_ns"] - cycles.used_ns)[1:]
+    # A record contains the bookkeeping of the previous cycle, because its own is not finished when
+    # the record is written.
+    closing_ns = rows["closed_ns"][1:] - rows["end_ns"][:-1]
     gap = rows["start_ns"][1:] - rows["closed_ns"][1:]
-    # Interrupted, as by the clock in lockstep, it seems longer than it was; then the way to the
-    # next start is known.
-    closing = np.where(closing > beyond, beyond - np.minimum(gap, beyond), closing)
+    # An interruption, for example by the clock in lockstep, makes the bookkeeping appear too long.
+    # In this case, subtract the known gap to the next start from the rest of the processor time.
+    closing_ns = np.where(closing_ns > rest_ns, rest_ns - np.minimum(gap, rest_ns), closing_ns)
     read_ns, process_ns, write_ns = (
         times_ns[1:]
         for times_ns in (
@@ -204,6 +216,6 @@ def parts_of(cycles: Cycles) -> dict[str, np.ndarray]:
             cycles.write_ns,
         )
     )
-    times = beyond - closing, read_ns, process_ns, write_ns, closing
-    judged = cycles.is_judged[1:]
-    return {part: time[judged] * 1e-3 for part, time in zip(PARTS, times, strict=True)}
+    times = rest_ns - closing_ns, read_ns, process_ns, write_ns, closing_ns
+    is_judged = cycles.is_judged[1:]
+    return {part: ns[is_judged] * 1e-3 for part, ns in zip(PARTS, times, strict=True)}

@@ -1,9 +1,8 @@
-"""`cyclictest` of rt-tests: how late this machine wakes a C program that sleeps to the points of a
-grid.
+"""Lateness of a C program on this machine, measured with `cyclictest` of rt-tests.
 
-No board can wake earlier than that, so it is the measure of every board's lateness, and of the
-deadlines that the machine itself breaks: under a hypervisor a core is away for milliseconds at a
-time.
+The program sleeps until the points of a time grid. No board can wake up earlier, so its lateness is
+the reference for the lateness of every board. It also shows which deadlines the machine itself
+breaks: under a hypervisor a core can be unavailable for milliseconds.
 """
 
 from __future__ import annotations
@@ -23,15 +22,22 @@ from rack.tools.lab.benches.harness import Absent, finished
 
 CYCLICTEST = "cyclictest"
 LONGEST_US = 100_000
-"""Largest lateness that has a place of its own in the histogram; one beyond it counts as the
-maximum."""
+"""Largest lateness with a separate bin in the histogram, us.
+
+Larger ones are counted at the maximum.
+"""
 PATIENCE_S = 30.0
-"""Time that it may take in addition to its wakes."""
+"""Time that the program may take in addition to its wakes, s."""
 
 
 class WakeGrid(NamedTuple):
-    """Points in time to sleep to on `core`: `wakes` of them, `period_ns` apart, at a `priority` of
-    SCHED_FIFO.
+    """Points in time for which the program sleeps.
+
+    Attributes:
+        core: Core of the program.
+        period_ns: Distance of the points, ns.
+        wakes: Number of points.
+        priority: SCHED_FIFO priority.
     """
 
     core: int
@@ -41,7 +47,7 @@ class WakeGrid(NamedTuple):
 
 
 def absent_cyclictest() -> tuple[Absent, ...]:
-    """Return what `cyclictest` lacks; nothing if it can run."""
+    """Report why `cyclictest` cannot run. Empty if it can."""
     if shutil.which(CYCLICTEST) is None:
         return (Absent(CYCLICTEST, f"no program '{CYCLICTEST}'", "apt-get install rt-tests"),)
     if not permits_fifo():
@@ -50,20 +56,20 @@ def absent_cyclictest() -> tuple[Absent, ...]:
 
 
 def permits_fifo() -> bool:
-    """Return whether this process may take a real-time priority."""
+    """Return True if this process may take a real-time priority."""
     return set_priority(1) and set_priority(0)
 
 
 def cyclictest(grid: WakeGrid) -> np.ndarray:
-    """Return the lateness of every wake, us, shape (n,), smallest first.
+    """Run `cyclictest` and return the lateness of every wake, us, shape (n,), smallest first.
 
-    It leaves idle cores as they are, as a rack does by default (`--laptop`).
+    Idle cores are left as they are (`--laptop`), as a rack leaves them by default.
 
     Raises:
-        Failure: If it cannot run.
+        Failure: If the program fails.
     """
     with TemporaryDirectory(prefix="rack-bench-") as folder:
-        path = Path(folder) / "found.json"
+        json_path = Path(folder) / "found.json"
         command = [
             *(CYCLICTEST, "--quiet", "--mlockall", "--policy=fifo", "--laptop", "--threads=1"),
             f"--affinity={grid.core}",
@@ -71,25 +77,33 @@ def cyclictest(grid: WakeGrid) -> np.ndarray:
             f"--interval={grid.period_ns // 1000}",
             f"--loops={grid.wakes}",
             f"--histogram={LONGEST_US}",
-            f"--json={path}",
+            f"--json={json_path}",
         ]
-        bound_s = grid.wakes * grid.period_ns * 1e-9 + PATIENCE_S
-        done = finished(CYCLICTEST, command, bound_s)
-        if done.returncode or not path.is_file():
-            status = f"exit status {done.returncode}, and no figures"
-            raise Failure(f"{CYCLICTEST}: {' '.join(done.stderr.split()) or status}")
-        (thread,) = json.loads(path.read_text())["thread"].values()
+        timeout_s = grid.wakes * grid.period_ns * 1e-9 + PATIENCE_S
+        completed = finished(CYCLICTEST, command, timeout_s)
+        if completed.returncode or not json_path.is_file():
+            status = f"exit status {completed.returncode}, and no figures"
+            raise Failure(f"{CYCLICTEST}: {' '.join(completed.stderr.split()) or status}")
+        (thread,) = json.loads(json_path.read_text())["thread"].values()
     counts = thread["histogram"]
-    beyond = thread["cycles"] - sum(counts.values())
-    return np.repeat([*map(float, counts), float(thread["max"])], [*counts.values(), beyond])
+    beyond_count = thread["cycles"] - sum(counts.values())
+    return np.repeat([*map(float, counts), float(thread["max"])], [*counts.values(), beyond_count])
 
 
 def late_share(runs: Sequence[np.ndarray], period_ns: int) -> float | None:
-    """Return the share of grid points at which a sleeper was late by a cycle or more, those it
-    skipped included; `runs` have the lateness of its wakes, us. None without any run.
+    """Return the fraction of grid points at which a program was late by a cycle or more.
+
+    Skipped points are included.
+
+    Args:
+        runs: Lateness of the wakes in each run, us.
+        period_ns: Distance of the grid points, ns.
+
+    Returns:
+        The fraction. None without any run.
     """
     if not runs:
         return None
-    passed = np.floor(np.concatenate(runs) * 1e3 / period_ns)
-    points = len(passed) + np.clip(passed - 1, 0, None).sum()
-    return float(passed.sum() / points) if points else 0.0
+    periods_late = np.floor(np.concatenate(runs) * 1e3 / period_ns)
+    points = len(periods_late) + np.clip(periods_late - 1, 0, None).sum()
+    return float(periods_late.sum() / points) if points else 0.0

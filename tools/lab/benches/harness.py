@@ -1,13 +1,14 @@
-"""What the benches of `rack bench` share. Each answers one question of a user, which its help says.
+"""Common part of the benches of `rack bench`.
 
-A bench is a function `measure(..., progress)` that returns a `Comparison`: a record of what it has
-found. `show` calls it, with the progress on the terminal, and prints the record as text or as one
-JSON document.
+The help of each bench states the question that it answers. A bench is a function
+`measure_...(..., progress)` that returns its results as a `Comparison`. `measure_and_show` calls
+the function, shows the progress on the terminal, and prints the results as text or as one JSON
+document.
 
-A machine's speed drifts by a factor of two within a day, so no time means much alone. Contestants
-are measured by turns (`interleaved`) in an order that changes from round to round, and each is
-judged by the ratio of its median to that of the baseline in the same case. A peer that this machine
-lacks is `Absent`: it is named, and the others are measured all the same.
+The speed of a machine drifts by a factor of two within a day, therefore absolute times mean little.
+`call_interleaved` calls the contestants alternately, in an order that changes from round to round.
+Each one is judged by the ratio of its median to the median of the baseline in the same case. A peer
+that is not installed is reported as `Absent`, and the others are still measured.
 """
 
 from __future__ import annotations
@@ -32,19 +33,20 @@ if TYPE_CHECKING:
     from rack.tools.console.progress import Progress
 
 EXTRA = "pip install 'nasrem-rack[lab]'"
-"""Brings the peers that are Python packages."""
+"""Command that installs the peers that are Python packages."""
 END_S = 1.2
-"""Longest wait for a program that was asked to end."""
+"""Longest wait for a program to end after SIGTERM, s."""
 FIGURES = ("median", "p99", "best", "worst")
-"""Figures of a sample, in its unit."""
+"""Statistics of a sample, in the unit of the sample."""
 _Name = TypeVar("_Name")
 _Result = TypeVar("_Result")
 
 
 @dataclass(frozen=True)
 class Sample:
-    """The raw measurements of one contestant in one case, such as "time-slice" at "200 B"; smaller
-    is better.
+    """Raw measurements of one contestant in one case, such as "time-slice" at "200 B".
+
+    Smaller values are better.
     """
 
     case: str
@@ -58,22 +60,22 @@ class Sample:
 
     @cached_property
     def median(self) -> float:
-        """The median."""
+        """Median of the values."""
         return float(np.median(self.values))
 
     @cached_property
     def p99(self) -> float:
-        """The value that one in a hundred exceeds."""
+        """99th percentile of the values."""
         return float(np.percentile(self.values, 99.0))
 
     @property
     def best(self) -> float:
-        """The smallest."""
+        """Smallest value."""
         return min(self.values)
 
     @property
     def worst(self) -> float:
-        """The largest."""
+        """Largest value."""
         return max(self.values)
 
     @property
@@ -84,7 +86,13 @@ class Sample:
 
 @dataclass(frozen=True)
 class Absent:
-    """A contestant that this machine lacks, and the command that installs it; empty: none does."""
+    """A contestant that is not available on this machine.
+
+    Attributes:
+        who: Name of the contestant.
+        reason: Reason for its absence.
+        install: Command that installs it. Empty if there is none.
+    """
 
     who: str
     reason: str
@@ -92,13 +100,13 @@ class Absent:
 
     @property
     def line(self) -> str:
-        """All of it as one line."""
+        """Name, reason and command for installation in one line."""
         hint = f"; to install: {self.install}" if self.install else ""
         return f"absent: {self.who}: {self.reason}{hint}"
 
 
 def absent_package(who: str, module: str) -> tuple[Absent, ...]:
-    """Return what a Python package lacks; nothing if it can be imported."""
+    """Report a contestant whose Python module cannot be imported. Empty if it can be."""
     try:
         import_module(module)
     except ImportError as error:
@@ -107,15 +115,28 @@ def absent_package(who: str, module: str) -> tuple[Absent, ...]:
 
 
 def finished(
-    called: str,
+    label: str,
     argv: Sequence[str],
-    bound_s: float,
+    timeout_s: float,
     environment: Mapping[str, str] | None = None,
-    text: str = "",
+    input_text: str = "",
 ) -> subprocess.CompletedProcess[str]:
-    """Run a program, `called` so in messages, to its end, with `text` as its input. Raises
-    `Failure` if it takes longer than `bound_s`. Ends it, in order if it can, if this process is
-    interrupted.
+    """Run a program to its end.
+
+    The program is ended, gently if possible, if it takes too long or this process is interrupted.
+
+    Args:
+        label: Name of the program in error messages.
+        argv: Program and arguments.
+        timeout_s: Longest permitted time, s.
+        environment: All of its environment variables. None to inherit them.
+        input_text: Text for its standard input.
+
+    Returns:
+        Exit status and output.
+
+    Raises:
+        Failure: If the program takes longer than `timeout_s`.
     """
     pipe = subprocess.PIPE
     process = subprocess.Popen(
@@ -128,19 +149,20 @@ def finished(
         errors="replace",
     )
     try:
-        out, err = process.communicate(text, timeout=bound_s)
+        stdout, stderr = process.communicate(input_text, timeout=timeout_s)
     except subprocess.TimeoutExpired:
-        raise Failure(f"{called}: still running after {bound_s:g} s") from None
+        raise Failure(f"{label}: still running after {timeout_s:g} s") from None
     finally:
         if process.poll() is None:
             _end(process)
-    return subprocess.CompletedProcess(argv, process.returncode, out, err)
+    return subprocess.CompletedProcess(argv, process.returncode, stdout, stderr)
 
 
 @contextmanager
 def pinned(core: int, priority: int = 0) -> Iterator[None]:
-    """Keep the calling process on a core, at a real-time priority if that is permitted, while the
-    context lasts.
+    """Keep the calling process on a core while the context lasts.
+
+    It also takes the real-time priority if this is permitted.
     """
     cores = os.sched_getaffinity(0)
     try:
@@ -153,6 +175,7 @@ def pinned(core: int, priority: int = 0) -> Iterator[None]:
 
 
 def _end(process: subprocess.Popen[str]) -> None:
+    """Terminate a program, and kill it if it does not react in time."""
     process.terminate()
     try:
         process.communicate(timeout=END_S)
@@ -163,11 +186,16 @@ def _end(process: subprocess.Popen[str]) -> None:
 
 @dataclass(frozen=True)
 class Comparison:
-    """All samples of a bench. `baselines` names the contestant of each case that the others are
-    compared with.
+    """All samples of a bench, with their baselines.
 
-    `name` is one word, as in the command; `title` says what is measured. A case without a baseline
-    has no ratios. `conclusion` is what follows from the figures, in one line; empty: nothing.
+    Attributes:
+        name: Name of the bench in the command, one word.
+        title: Description of the measured quantity.
+        samples: Samples of all cases and contestants.
+        baselines: Contestant of each case with which the others are compared. A case without a
+            baseline has no ratios.
+        absent: Contestants that are not available.
+        conclusion: Conclusion from the figures, in one line. Empty if there is none.
     """
 
     name: str
@@ -178,12 +206,18 @@ class Comparison:
     conclusion: str = ""
 
     def sample(self, case: str, who: str) -> Sample | None:
-        """Return one sample; None where the contestant was not measured."""
+        """Return one sample. None if the contestant was not measured in this case."""
         return self._samples.get((case, who))
 
     def ratio(self, sample: Sample, figure: str = "median") -> float | None:
-        """Return a figure of a sample divided by that of its baseline; None without one, or where
-        that is 0.
+        """Return a statistic of a sample divided by the same statistic of its baseline.
+
+        Args:
+            sample: Sample to compare.
+            figure: One of the statistics.
+
+        Returns:
+            The ratio. None without a baseline, or if the statistic of the baseline is 0.
         """
         baseline = self._samples.get((sample.case, self.baselines.get(sample.case, "")))
         if baseline is None or not getattr(baseline, figure):
@@ -195,23 +229,24 @@ class Comparison:
         return {(sample.case, sample.who): sample for sample in self.samples}
 
     def document(self) -> dict[str, Any]:
-        """Return everything as plain data, without the raw values."""
+        """Convert the comparison to plain data, without the raw values."""
         return {
             "bench": self.name,
             "title": self.title,
             "baselines": dict(self.baselines),
             "samples": [self._figures(sample) for sample in self.samples],
-            "absent": [asdict(one) for one in self.absent],
+            "absent": [asdict(absentee) for absentee in self.absent],
             "conclusion": self.conclusion,
         }
 
     def _figures(self, sample: Sample) -> dict[str, Any]:
+        """Return the statistics of a sample and its ratios to the baseline."""
         names = ("case", "who", "unit", "count", *FIGURES)
         ratios = {"ratio": self.ratio(sample), "p99_ratio": self.ratio(sample, "p99")}
         return {name: getattr(sample, name) for name in names} | ratios
 
     def blocks(self) -> Blocks:
-        """Yield the figures as text for people: a table, the absent contestants, the conclusion."""
+        """Yield the results for the terminal: a table, absent contestants and the conclusion."""
         yield self.title
         rows: list[dict[str, Cell]] = [
             {
@@ -226,7 +261,7 @@ class Comparison:
             for sample in self.samples
         ]
         yield TextTable(rows, ("count", "worst", "p99 ratio", "best"))
-        yield from (one.line for one in self.absent)
+        yield from (absentee.line for absentee in self.absent)
         if self.conclusion:
             yield self.conclusion
 
@@ -235,20 +270,20 @@ Found = TypeVar("Found", bound=Comparison)
 
 
 def show(measure: Callable[[Progress], Found], as_json: bool) -> Found:
-    """Measure, with the progress on the terminal; print what was found, and return it."""
+    """Run a bench with its progress on the terminal, print the result, and return it."""
     from rack.tools.console.progress import progress_for
 
     with progress_for(as_json) as progress:
-        found = measure(progress)
+        comparison = measure(progress)
     if as_json:
-        print_json(found.document())
+        print_json(comparison.document())
     else:
-        print_blocks(found.blocks())
-    return found
+        print_blocks(comparison.blocks())
+    return comparison
 
 
 def shown(value: float) -> str:
-    """Return a value with three significant digits, never in powers of ten."""
+    """Format a value with three significant digits, never with an exponent."""
     return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
 
 
@@ -258,19 +293,27 @@ def interleaved(
     progress: Progress | None = None,
     each_s: float = 0.0,
 ) -> dict[_Name, list[_Result]]:
-    """Call every contestant once a round; return the results of each, oldest first.
+    """Call every contestant once in each round.
 
-    Every round has another order, the same in every run of the bench. Progress, if given, is told
-    of each call, which takes about `each_s`.
+    The order changes from round to round, but is the same in every run of the bench.
+
+    Args:
+        contestants: Function of each contestant, by name.
+        rounds: Number of rounds.
+        progress: Shows each call. None for no progress.
+        each_s: Expected time of a call, s.
+
+    Returns:
+        The results of each contestant, oldest first.
     """
-    found: dict[_Name, list[_Result]] = {name: [] for name in contestants}
+    results: dict[_Name, list[_Result]] = {name: [] for name in contestants}
     random = Random(rounds)
-    for turn in range(1, rounds + 1):
+    for round_number in range(1, rounds + 1):
         for name in random.sample([*contestants], len(contestants)):
             if progress is not None:
                 words = name if isinstance(name, tuple) else (name,)
-                progress.begin(f"{', '.join(map(str, words))}: round {turn} of {rounds}")
-            found[name].append(contestants[name]())
+                progress.begin(f"{', '.join(map(str, words))}: round {round_number} of {rounds}")
+            results[name].append(contestants[name]())
             if progress is not None:
                 progress.end(each_s)
-    return found
+    return results

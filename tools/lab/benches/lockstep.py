@@ -1,9 +1,8 @@
-"""How fast racks run in lockstep: next to the same levels in one process without a rack, and to
-another checkout.
+"""Speed of racks in lockstep, compared with their levels in one process and another checkout.
 
-The limit is honest only if it is the same work: once, its last messages and their numbers are
-compared with those of a recorded run. It counts processor time, which nothing else on the machine
-prolongs.
+The levels alone are a fair limit only if they do the same work. Their last messages and serials are
+therefore compared once with a recorded run. Their processor time is measured, because no other
+program on the machine prolongs it.
 """
 
 from __future__ import annotations
@@ -30,19 +29,23 @@ from rack.tools.lab.benches.harness import Comparison, Sample, interleaved, show
 from rack.tools.recording.recording import Recording
 
 RACKS: Mapping[str, float | None] = {"nasrem": None, "k1607": None, "fig4": 10.0}
-"""The racks, and the simulated seconds of a run; None: until the task ends."""
+"""Simulated time of a run of each rack, s. None to run until its task ends."""
 BARE = "no rack"
 EXPECTED_S = 10.0
-"""About how long a run takes."""
+"""Approximate time of a run, s."""
 BOUND_S = 600.0
 
 
 @dataclass(frozen=True)
 class BareRun:
-    """A finished run of levels alone. `processor_s` is the time of its ticks.
+    """A finished run of levels without a rack.
 
-    `last` is the newest message of each mailbox that was visible before the end, `serials` its
-    number; without one, a mailbox is left out.
+    Attributes:
+        ticks: Length of the run.
+        processor_s: Processor time of all ticks, s.
+        serials: Serial of the newest message of each mailbox that was visible before the end.
+            Mailboxes without a message are left out.
+        last: The message with that serial.
     """
 
     ticks: int
@@ -54,11 +57,19 @@ class BareRun:
 def measure(
     against: Path | None, racks: Mapping[str, float | None], rounds: int, progress: Progress
 ) -> Comparison:
-    """Run every rack, its levels without a rack, and another checkout's, by turns; times in ms a
-    simulated second.
+    """Run every rack, its levels without a rack, and the rack of another checkout alternately.
+
+    Args:
+        against: The other checkout. None if there is none.
+        racks: Simulated time of each rack, s. None to run until its task ends.
+        rounds: Number of runs of each contestant.
+        progress: Shows each run.
+
+    Returns:
+        Times per simulated second, ms.
 
     Raises:
-        Failure: If a run fails, or if the levels without a rack did other work.
+        Failure: If a run fails, or if the levels without a rack did different work.
     """
     commands = rack_commands(against)
     progress.total(EXPECTED_S * len(racks) * (1 + rounds * (1 + len(commands))))
@@ -72,15 +83,13 @@ def measure(
         progress.end(EXPECTED_S, "equal")
         runs = {each.name: partial(_run, each, rack, options) for each in commands}
         runs[BARE] = partial(_run_bare, rack, ticks)
-        found = interleaved(runs, rounds, progress, EXPECTED_S)
-        samples += [Sample(rack, who, tuple(times_ms), "ms") for who, times_ms in found.items()]
+        times = interleaved(runs, rounds, progress, EXPECTED_S)
+        samples += [Sample(rack, who, tuple(times_ms), "ms") for who, times_ms in times.items()]
     return compare(samples, commands[-1].name if against else BARE)
 
 
 def compare(samples: Sequence[Sample], baseline: str) -> Comparison:
-    """Return the comparison of these samples with one contestant, and how many simulated seconds a
-    second they are.
-    """
+    """Compare samples with one contestant, and conclude with simulated seconds per second."""
     speeds = [f"{one.case} {shown(1e3 / one.median)} ({one.who})" for one in samples]
     return Comparison(
         name="lockstep",
@@ -92,26 +101,30 @@ def compare(samples: Sequence[Sample], baseline: str) -> Comparison:
 
 
 def _run(command: RackCommand, rack: str, options: Sequence[object]) -> float:
-    """Return the time of a simulated second, ms."""
-    words = ("run", rack, "--lockstep", "--no-record", "--json", *options)
-    found = json.loads(command.run(*words, bound_s=BOUND_S))
-    return _ms_a_second(rack, found["wall_s"], found["outcome"]["ticks"])
+    """Run a rack by a command, and return the time of a simulated second, ms."""
+    result = json.loads(
+        command.run("run", rack, "--lockstep", "--no-record", "--json", *options, bound_s=BOUND_S)
+    )
+    return _ms_a_second(rack, result["wall_s"], result["outcome"]["ticks"])
 
 
 def _run_bare(rack: str, ticks: int) -> float:
+    """Run the levels without a rack, and return the time of a simulated second, ms."""
     return _ms_a_second(rack, _bare(rack, ticks).processor_s, ticks)
 
 
-def _ms_a_second(rack: str, lasted_s: float, ticks: int) -> float:
-    return lasted_s / ticks * 1e12 / load(rack).clock_ns
+def _ms_a_second(rack: str, run_s: float, ticks: int) -> float:
+    """Convert the time of a run, s, to the time of a simulated second, ms."""
+    return run_s / ticks * 1e12 / load(rack).clock_ns
 
 
 def _bare(rack: str, ticks: int) -> BareRun:
+    """Run the levels without a rack in a new process with the environment of boards."""
     return apart(run_bare, load(rack, ["clock.mode=lockstep"]), ticks)
 
 
 def run_bare(config: RackConfig, ticks: int) -> BareRun:
-    """Run a rack's levels in this process for so many ticks."""
+    """Run the levels of a rack in this process for a number of ticks."""
     with OneProcess(config) as rack:
         start_ns = time.process_time_ns()
         rack.run_ticks(ticks)
@@ -121,42 +134,50 @@ def run_bare(config: RackConfig, ticks: int) -> BareRun:
 
 
 def _check(rack: str, options: Sequence[object], folder: Path) -> int:
-    """Record a rack in lockstep and compare it with its levels alone; return the ticks that it ran
-    for.
+    """Record a rack in lockstep and compare it with its levels alone.
+
+    Args:
+        rack: Config of the rack.
+        options: Options of `rack run`.
+        folder: Folder of the run.
+
+    Returns:
+        Length of the run, ticks.
+
+    Raises:
+        Failure: If the levels alone did different work.
     """
-    words = ("run", rack, "--lockstep", *options, "--out", folder)
-    rack_commands(None)[0].run(*words, bound_s=BOUND_S)
+    this_tree = rack_commands(None)[0]
+    this_tree.run("run", rack, "--lockstep", *options, "--out", folder, bound_s=BOUND_S)
     recording = Recording(folder)
     ticks = int(recording.ended["outcome"]["ticks"])
     differing = list(differences(recording, _bare(rack, ticks)))
     if differing:
         raise Failure(
-            f"{rack}: its levels without a rack did other work, first seen in {differing[0]}"
+            f"{rack}: its levels without a rack did different work, first in {differing[0]}"
         )
     return ticks
 
 
 def differences(recording: Recording, bare: BareRun) -> Iterator[str]:
-    """Yield every mailbox, or field of a message, in which a recorded run and its levels alone
-    differ.
+    """Yield every mailbox or message field in which a recorded run and its levels alone differ.
 
-    The message of each mailbox is the newest that was visible before the end. A later one need not
-    be recorded.
+    The newest message that was visible before the end is compared. Later ones may not be recorded.
     """
     for name in sorted({*recording.mailboxes, *bare.serials}):
-        seen = np.flatnonzero(recording.signal(name, "visible_at") < bare.ticks)
-        serial = recording.signal(name, "serial")[seen[-1]] if len(seen) else None
+        visible_rows = np.flatnonzero(recording.signal(name, "visible_at") < bare.ticks)
+        serial = recording.signal(name, "serial")[visible_rows[-1]] if len(visible_rows) else None
         if serial != bare.serials.get(name):
             yield f"the number of messages in {name}"
         elif serial is not None:
             last = bare.last[name]
             for field in sorted(recording.fields(name) & set(last.dtype.names or ())):
                 if not np.array_equal(
-                    _plain(recording.signal(name, field)[seen[-1]]), _plain(last[field])
+                    _plain(recording.signal(name, field)[visible_rows[-1]]), _plain(last[field])
                 ):
                     yield f"{name}, field {field}"
 
 
 def _plain(value: Any) -> Any:
-    """Return a value of a message; text as the recorder stores it."""
+    """Return a value of a message, with text converted as the recorder stores it."""
     return value.decode("ascii", "replace") if isinstance(value, bytes) else value

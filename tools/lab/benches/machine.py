@@ -1,9 +1,9 @@
-"""Whether this machine is fit for real time, and up to which rate: a rack next to `cyclictest`.
+"""Fitness of this machine for real time: a rack and `cyclictest` are compared at several rates.
 
-The rack runs at each rate in turn. Only its fastest board changes: the clock follows its rate, and
-every other board gets the cycle that is closest to its own. `cyclictest` sleeps to the same grid on
-the same core in the same minutes. A machine that wakes it a cycle late, as a hypervisor does that
-takes the core away, breaks deadlines that no program could keep.
+Only the fastest board of the rack changes its rate, and the clock follows it. Every other board
+keeps the cycle time that is closest to its normal one. `cyclictest` sleeps to the same grid on the
+same core in the same minutes. If the machine wakes `cyclictest` a cycle late, for example because a
+hypervisor takes the core away, it breaks deadlines that no program could keep.
 """
 
 from __future__ import annotations
@@ -47,20 +47,22 @@ from rack.tools.lab.benches.observed import (
 
 RATES_HZ = (400.0, 500.0, 1000.0, 2000.0)
 PERMITTED = 0.001
-"""Share of a board's cycles that may be missed beyond those of the machine, and share of
-`cyclictest`'s wakes that may be late by a cycle, for a rate to be held."""
+"""Largest share of late cycles at which a rate counts as held.
+
+It applies to the cycles that a board misses in addition to the machine's late wakes, and to the
+wakes of `cyclictest` that are late by a cycle.
+"""
 STEP_MS = 0.5
-"""Longest time step of the simulated arm, that of the bundled racks."""
+"""Longest time step of the simulated arm, ms, as in the bundled racks."""
 LAUNCH_S = 3.0
 AWAKE = ", idle cores awake"
-"""Ends the name of the rack that runs while idle cores are held awake."""
+"""Suffix of the name of the rack that runs with idle cores kept awake."""
 
 
 def at_rate(config: RackConfig, rate_hz: float) -> RackConfig:
-    """Return a rack whose fastest board cycles at `rate_hz`, at every tick; the others keep their
-    cycles, in ms.
+    """Return a rack whose fastest board cycles at `rate_hz`, at every tick.
 
-    A plan of that board still takes as long.
+    The other boards keep their cycle times, and plans of the fastest board keep their time limit.
 
     Raises:
         Failure: If the rack has no board at every tick.
@@ -68,8 +70,8 @@ def at_rate(config: RackConfig, rate_hz: float) -> RackConfig:
     fastest = [name for name in config.board if config.every(name) == 1]
     if not fastest:
         raise Failure(
-            f"rack '{config.name}': no board cycles at every tick of its clock, so none has a rate"
-            " to raise"
+            f"rack '{config.name}': no board cycles at every tick of its clock, therefore no rate"
+            " can be raised"
         )
     period_ms = 1e3 / rate_hz
     scale = config.clock.period_ms / period_ms
@@ -81,7 +83,7 @@ def at_rate(config: RackConfig, rate_hz: float) -> RackConfig:
         boards[name] = board.model_copy(update={**changes, "rate_hz": None})
     robot = config.robot
     if robot is not None:
-        # Rounded: 2.5 ms / 0.5 ms must be 5, whatever the last bit says.
+        # Rounding makes 2.5 ms / 0.5 ms exactly 5.
         robot = robot.model_copy(update={"substeps": math.ceil(round(period_ms / STEP_MS, 6))})
     clock = config.clock.model_copy(
         update={"period_ms": period_ms, "mode": "realtime", "speed": 1.0}
@@ -91,14 +93,14 @@ def at_rate(config: RackConfig, rate_hz: float) -> RackConfig:
 
 @dataclass(frozen=True)
 class RateFigures:
-    """All runs at one rate.
+    """Results of all runs at one rate.
 
     Attributes:
         rate_hz: The rate.
-        cycles: Cycles of the rack's fastest board that were due.
-        missed: Share of them that were missed or skipped.
-        late: Share of `cyclictest`'s wakes that were late by a cycle or more; None if it is absent.
-        failure: Why a run ended early; empty if none did.
+        cycles: Number of cycles of the rack's fastest board that were due.
+        missed: Share of these cycles that were missed or skipped.
+        late: Share of `cyclictest`'s wakes that were late by a cycle or more. None if it is absent.
+        failure: Reason for which a run ended early. Empty if none did.
     """
 
     rate_hz: float
@@ -109,7 +111,7 @@ class RateFigures:
 
     @property
     def reason(self) -> str:
-        """Why the rate is not held; empty if it is."""
+        """Reason for which the rate is not held. Empty if it is held."""
         late = self.late or 0.0
         if self.failure or late > PERMITTED:
             return self.failure or "the machine is late"
@@ -117,14 +119,18 @@ class RateFigures:
 
     @property
     def verdict(self) -> str:
-        """Whether the rate is held, and if not, why."""
+        """Verdict on the rate: held, or not held with the reason."""
         return f"not held: {self.reason}" if self.reason else "held"
 
 
 @dataclass(frozen=True)
 class Machine(Comparison):
-    """The figures of every rate, lowest first, and the lateness of the rack's fastest board `who`
-    next to `cyclictest`.
+    """Comparison of the lateness of a board with `cyclictest`, with a verdict on the machine.
+
+    Attributes:
+        who: Name of the rack's fastest board.
+        is_fifo: Whether real-time priorities are permitted.
+        rates: Results at every rate, lowest first.
     """
 
     who: str = ""
@@ -133,9 +139,12 @@ class Machine(Comparison):
 
     @property
     def highest_hz(self) -> float | None:
-        """The highest rate that is held, as all below it are; None if the lowest is not."""
-        held = takewhile(lambda one: not one.reason, self.rates)
-        return max((one.rate_hz for one in held), default=None)
+        """Highest rate that is held together with all lower ones.
+
+        None if the lowest is not held.
+        """
+        held_rates = takewhile(lambda rate: not rate.reason, self.rates)
+        return max((rate.rate_hz for rate in held_rates), default=None)
 
     @property
     def is_fit(self) -> bool:
@@ -144,9 +153,7 @@ class Machine(Comparison):
 
     @property
     def verdict(self) -> Iterator[str]:
-        """The answer in a few lines: whether the machine is fit, up to which rate, and why not
-        beyond.
-        """
+        """Lines that tell up to which rate the machine is fit, and why not beyond."""
         highest = self.highest_hz
         if not self.is_fifo:
             yield "not fit for real time: SCHED_FIFO is refused (see `ulimit -r`)"
@@ -154,19 +161,20 @@ class Machine(Comparison):
             yield f"not fit for real time at {self.rates[0].rate_hz:g} Hz or more"
         else:
             yield f"fit for real time up to {highest:g} Hz"
-        for one in self.rates:
-            late = "" if one.late is None else f", {CYCLICTEST} late in {one.late:.2%}"
-            counts = f"missed {one.missed:.2%} of {one.cycles} cycles{late}"
-            yield f"{one.rate_hz:g} Hz {one.verdict}; {counts}; {self._worst(one.rate_hz)}"
+        for rate in self.rates:
+            late = "" if rate.late is None else f", {CYCLICTEST} late in {rate.late:.2%}"
+            counts = f"missed {rate.missed:.2%} of {rate.cycles} cycles{late}"
+            yield (f"{rate.rate_hz:g} Hz {rate.verdict}; {counts}; {self._worst(rate.rate_hz)}")
 
     def _worst(self, rate_hz: float) -> str:
+        """Format the worst lateness of the board and of `cyclictest` at a rate."""
         samples = ((who, self.sample(_case(rate_hz), who)) for who in (self.who, CYCLICTEST))
         known = (f"{who} {shown(sample.worst)} us" for who, sample in samples if sample)
         return f"worst lateness: {', '.join(known) or 'unknown'}"
 
     def document(self) -> dict[str, Any]:
-        """Return everything as plain data, without the raw values."""
-        rates = [{**asdict(one), "held": not one.reason} for one in self.rates]
+        """Convert the comparison and the verdict to plain data, without the raw values."""
+        rates = [{**asdict(rate), "held": not rate.reason} for rate in self.rates]
         return {
             **super().document(),
             "fit": self.is_fit,
@@ -195,15 +203,18 @@ def measure(
     share: bool,
     progress: Progress,
 ) -> Machine:
-    """Run a rack at every rate, by turns with `cyclictest` on the core of its fastest board.
+    """Run a rack at every rate, alternately with `cyclictest` on the core of its fastest board.
 
     Args:
         name: Config of the rack, by name or path.
         rates_hz: Rates of its fastest board.
-        seconds: Time of each run.
+        seconds: Time of each run, s.
         rounds: Number of runs of each contestant.
         share: Whether cores may be shared with another rack.
-        progress: Told of each rate.
+        progress: Shows each rate.
+
+    Returns:
+        Comparison of all rates.
 
     Raises:
         Failure: If the rack has no board at every tick, or `cyclictest` fails.
@@ -212,12 +223,12 @@ def measure(
     racks = {rate_hz: at_rate(config, rate_hz) for rate_hz in sorted(set(rates_hz))}
     fastest = next(board for board in config.board if config.every(board) == 1)
     core = obtained_core(config.board[fastest].core)
-    who = f"'{fastest}' of {Path(name).stem}"
+    label = f"'{fastest}' of {Path(name).stem}"
     absent = [*absent_cyclictest()]
     is_compared = not absent
     with cores_kept_awake() as refusal:
         if refusal:
-            absent.append(Absent(who + AWAKE, refusal))
+            absent.append(Absent(label + AWAKE, refusal))
     each_s = rounds * (3 * seconds + 2 * LAUNCH_S)
     progress.total(len(racks) * each_s)
     rates = []
@@ -228,25 +239,25 @@ def measure(
         wakes = max(1, round(seconds * rate_hz))
         grid = WakeGrid(core, round(1e9 / rate_hz), wakes, priority)
         contestants: dict[str, Callable[[], RackRun]] = {
-            who: partial(_run, rack, fastest, seconds, share, awake=False)
+            label: partial(_run, rack, fastest, seconds, share, awake=False)
         }
         if not refusal:
-            contestants[who + AWAKE] = partial(_run, rack, fastest, seconds, share, awake=True)
+            contestants[label + AWAKE] = partial(_run, rack, fastest, seconds, share, awake=True)
         if is_compared:
             contestants[CYCLICTEST] = partial(_sleep, grid)
-        found = interleaved(contestants, rounds)
-        for one, each in found.items():
-            late_us = np.concatenate([run.late_us for run in each])
+        runs = interleaved(contestants, rounds)
+        for contestant, its_runs in runs.items():
+            late_us = np.concatenate([run.late_us for run in its_runs])
             if len(late_us):
-                samples.append(Sample(_case(rate_hz), one, tuple(late_us.tolist()), "us"))
-        cycles = count_cycles(run.counts for run in found[who])
+                samples.append(Sample(_case(rate_hz), contestant, tuple(late_us.tolist()), "us"))
+        cycles = count_cycles(run.counts for run in runs[label])
         rates.append(
             RateFigures(
                 rate_hz=rate_hz,
                 cycles=cycles.due,
                 missed=cycles.share,
-                late=late_share([run.late_us for run in found.get(CYCLICTEST, ())], grid.period_ns),
-                failure=next(filter(None, (run.failure for run in found[who])), ""),
+                late=late_share([run.late_us for run in runs.get(CYCLICTEST, ())], grid.period_ns),
+                failure=next(filter(None, (run.failure for run in runs[label])), ""),
             )
         )
         progress.end(each_s, rates[-1].verdict)
@@ -256,16 +267,20 @@ def measure(
         samples=tuple(samples),
         baselines=dict.fromkeys(map(_case, racks), CYCLICTEST),
         absent=tuple(absent),
-        conclusion=compare_idle_cores(samples, who),
-        who=who,
+        conclusion=compare_idle_cores(samples, label),
+        who=label,
         is_fifo=permits_fifo(),
         rates=tuple(rates),
     )
 
 
 class RackRun(NamedTuple):
-    """One run of a contestant: the lateness of its wakes, us; of a rack also the counts of its
-    board's cycles, and why it ended early.
+    """One run of a contestant.
+
+    Attributes:
+        late_us: Lateness of its wakes, us.
+        counts: Counts of the board's cycles. Empty for `cyclictest`.
+        failure: Reason for which a rack's run ended early. Empty if it did not.
     """
 
     late_us: np.ndarray
@@ -274,6 +289,7 @@ class RackRun(NamedTuple):
 
 
 def _run(rack: RackConfig, board: str, seconds: float, share: bool, awake: bool) -> RackRun:
+    """Run a rack once, and return the lateness of a board with its counts."""
     with (
         TemporaryDirectory(prefix="rack-bench-") as folder,
         cores_kept_awake() if awake else nullcontext(),
@@ -288,22 +304,29 @@ def _sleep(grid: WakeGrid) -> RackRun:
 
 
 def compare_idle_cores(samples: Sequence[Sample], who: str) -> str:
-    """Return which `clock.idle_cores` suits this machine, with the figures that say so; empty
-    unless both were measured.
+    """Return which value of `clock.idle_cores` suits this machine, with the figures.
 
-    Lost wake-ups decide if the counts are apart by more than chance, two standard deviations of it;
-    if not, the worst wake-up: a core that its host takes away shows there first.
+    The setting with fewer lost wake-ups wins if the counts differ by more than two standard
+    deviations of chance. Otherwise the better worst wake-up decides, because it shows first when a
+    host takes the core away.
+
+    Args:
+        samples: Lateness of all contestants.
+        who: Name of the rack's fastest board.
+
+    Returns:
+        The recommendation. Empty unless both settings were measured.
     """
-    found = []
+    results = []
     for setting, name in (("sleep", who), ("awake", who + AWAKE)):
-        own = [sample for sample in samples if sample.who == name]
-        if not own:
+        runs = [sample for sample in samples if sample.who == name]
+        if not runs:
             return ""
-        lost = sum(us >= 1e6 / float(one.case.split()[0]) for one in own for us in one.values)
-        worst_us = max(one.worst for one in own)
-        words = f'"{setting}", {lost} wake-ups late by a period, worst {shown(worst_us)} us'
-        found.append((lost, worst_us, words))
-    total = sum(lost for lost, _, _ in found)
-    is_apart = abs(found[0][0] - found[1][0]) > 2.0 * math.sqrt(total)
-    best, other = sorted(found, key=lambda one: one[0] if is_apart else one[1])
+        lost = sum(us >= 1e6 / float(each.case.split()[0]) for each in runs for us in each.values)
+        worst_us = max(each.worst for each in runs)
+        figures = f'"{setting}", {lost} wake-ups late by a period, worst {shown(worst_us)} us'
+        results.append((lost, worst_us, figures))
+    total = sum(lost for lost, _, _ in results)
+    is_apart = abs(results[0][0] - results[1][0]) > 2.0 * math.sqrt(total)
+    best, other = sorted(results, key=lambda result: result[0] if is_apart else result[1])
     return f"clock.idle_cores that suits this machine: {best[2]}; with {other[2]}"

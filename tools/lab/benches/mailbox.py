@@ -1,8 +1,8 @@
-"""A message, written and read: every protocol of ours next to other ways of the same machine.
+"""Time to write and read a message: our protocols and other transports on the same machine.
 
-Each turn numbers a message, sends it, and lets every reader receive it into fields of its own.
-Filling and taking the fields costs every contestant the same, and is left out. All happens in one
-process: what is compared is the work, not the wake-up of another process.
+In each exchange a message gets a number and is sent, and every reader receives it into local
+fields. Filling and reading the fields costs the same for every contestant and is not measured. All
+of this happens in one process: the bench compares the work, not the wake-up of another process.
 """
 
 from __future__ import annotations
@@ -40,17 +40,19 @@ from rack.tools.lab.benches.harness import (
 from rack.tools.lab.benches.transports import PEERS, Peer, Transport
 
 SIZES = {"64 B": 64, "200 B": 200, "2 kB": 2048, "16 kB": 16384}
-"""Bytes of a message: a serial, and three arrays of numbers."""
+"""Message sizes in bytes. A message has a serial and three arrays of numbers."""
 READERS = (1, 4)
 BATCH_S = 0.001
-"""About how long one measurement takes: many exchanges, and their mean. Short: most end without an
-interruption."""
+"""Approximate time of one measurement, which is the mean of many exchanges, s.
+
+It is short, so that most measurements end without an interruption.
+"""
 CASE_S = 5.0
-"""About how long a case takes."""
+"""Approximate time of a case, s."""
 
 
 class Bench(Command, version=1):
-    """The message whose transport is measured."""
+    """Message whose transport is measured."""
 
     position: np.ndarray = field(unit="rad", doc="joint positions", shape="joints")
     velocity: np.ndarray = field(unit="rad/s", doc="joint velocities", shape="joints")
@@ -65,12 +67,12 @@ class Case(NamedTuple):
 
     @property
     def name(self) -> str:
-        """The case, in words."""
+        """Name of the case for people."""
         return f"{self.size}, {counting(self.readers, 'reader')}"
 
     @property
     def lengths(self) -> dict[str, int]:
-        """Lengths of the arrays that fill the message."""
+        """Lengths of the arrays that give the message its size."""
         numbers = SIZES[self.size] // 8 - 1
         return {"joints": numbers // 3, "rest": numbers - 2 * (numbers // 3)}
 
@@ -79,34 +81,47 @@ CASES = tuple(Case(size, readers) for readers in READERS for size in SIZES)
 
 
 def measure(cases: Sequence[Case], rounds: int, progress: Progress) -> Comparison:
-    """Measure every contestant that is installed in every case; the baseline of a case is its best
-    peer.
+    """Measure every installed contestant in every case.
+
+    Args:
+        cases: Message sizes and numbers of readers.
+        rounds: Number of measurements of each contestant.
+        progress: Shows each case.
+
+    Returns:
+        Comparison with the best peer of each case.
     """
-    missing = {peer.name: absent_package(peer.name, peer.module) for peer in PEERS}
-    present = [peer for peer in PEERS if not missing[peer.name]]
+    absentees = {peer.name: absent_package(peer.name, peer.module) for peer in PEERS}
+    present = [peer for peer in PEERS if not absentees[peer.name]]
     progress.total(CASE_S * len(cases))
     samples: list[Sample] = []
     for case in cases:
         progress.begin(case.name)
         samples += _measure_case(case, present, rounds)
         progress.end(CASE_S)
-    absent = tuple(one for each in missing.values() for one in each)
+    absent = tuple(absentee for each in absentees.values() for absentee in each)
     return compare(samples, absent)
 
 
 def compare(samples: Sequence[Sample], absent: tuple[Absent, ...]) -> Comparison:
-    """Return the comparison of these samples with the best peer of each case."""
+    """Compare samples with the best peer of each case."""
     peers = {peer.name for peer in PEERS}
     baselines = {}
     for case in dict.fromkeys(sample.case for sample in samples):
-        own = [sample for sample in samples if sample.case == case and sample.who in peers]
-        if own:
-            baselines[case] = min(own, key=lambda sample: sample.median).who
-    title = "A message written and read; ratio to the best peer of the case"
-    return Comparison("mailbox", title, tuple(samples), baselines, absent)
+        peer_samples = [sample for sample in samples if sample.case == case and sample.who in peers]
+        if peer_samples:
+            baselines[case] = min(peer_samples, key=lambda sample: sample.median).who
+    return Comparison(
+        "mailbox",
+        "A message written and read; ratio to the best peer of the case",
+        tuple(samples),
+        baselines,
+        absent,
+    )
 
 
 def _measure_case(case: Case, peers: Sequence[Peer], rounds: int) -> list[Sample]:
+    """Measure all contestants in one case."""
     dtype = Bench.message_type.dtype(case.lengths)
     with ExitStack() as stack:
         transports: dict[str, Transport] = {
@@ -115,16 +130,23 @@ def _measure_case(case: Case, peers: Sequence[Peer], rounds: int) -> list[Sample
         transports |= {
             peer.name: stack.enter_context(peer.opened(dtype, case.readers)) for peer in peers
         }
-        turns = {
+        exchanges = {
             name: exchange(name, transport, case.lengths) for name, transport in transports.items()
         }
-        found = interleaved(turns, rounds)
-    return [Sample(case.name, name, tuple(values), "us") for name, values in found.items()]
+        times_us = interleaved(exchanges, rounds)
+    return [Sample(case.name, name, tuple(values), "us") for name, values in times_us.items()]
 
 
 def exchange(name: str, transport: Transport, lengths: dict[str, int]) -> Callable[[], float]:
-    """Return a function that makes many exchanges through a transport, and returns the us that each
-    took. Raises `Failure` if a reader receives another message than the one sent.
+    """Build a function that makes many exchanges and returns the time of one, us.
+
+    Args:
+        name: Name of the contestant.
+        transport: Transport to use.
+        lengths: Lengths of the message's arrays.
+
+    Raises:
+        Failure: If a reader receives another message than the one sent.
     """
     message, send, readers = transport
     for key, length in (("position", "joints"), ("velocity", "joints"), ("torque", "rest")):
@@ -152,44 +174,45 @@ def exchange(name: str, transport: Transport, lengths: dict[str, int]) -> Callab
 
 @contextmanager
 def _mailbox(protocol: Protocol, case: Case) -> Iterator[Transport]:
-    """Give a mailbox of ours, in a segment of its own."""
+    """Open a mailbox of ours in a separate segment."""
     rack = f"bench-{os.getpid()}-{protocol}"
     layout = _layout(rack, protocol, case)
     with ExitStack() as names:
-        # Before they exist: an interrupt may come at any time.
+        # Register the clean-up before the names exist, because an interrupt may come at any time.
         names.callback(unlink, rack)
         segment = Segment.create(layout, "")
         (box,) = layout.mailboxes
         writer = open_writer(segment, box.name)
         readers = [_reading(segment, box, task) for task in box.readers]
-    # Open, it needs no name: nothing is left even if this process is killed.
+    # An open segment needs no name. Nothing is left even if this process is killed.
     send = WriteTable([(writer, ())]).write if can_write(writer) else writer.write
     yield Transport(writer.message, send, readers)
 
 
 def _reading(segment: Segment, box: MailboxSpec, task: str) -> Callable[[int], AnyMessage]:
-    """Return a function that reads as a board does; without its checks on the writer, where no
-    machine code makes them.
+    """Build a function that reads a mailbox as a board does.
+
+    Where no machine code exists, the checks on the writer are left out.
     """
     inbox = open_inbox(segment, task)
-    found = watched(segment, box.name, AlarmWriter(segment, task), ReadingTask(inbox))
-    read = found.reader.read
+    watched_reader = watched(segment, box.name, AlarmWriter(segment, task), ReadingTask(inbox))
+    read = watched_reader.reader.read
     delay = box.delay
-    message = found.reader.message
-    line = Line({}, box.name, found.read, found)
+    message = watched_reader.reader.message
+    line = Line({}, box.name, watched_reader.read, watched_reader)
     if can_read(line):
         read_table = ReadTable([line]).read
 
-        def take_from_table(tick: int) -> AnyMessage:
+        def read_by_table(tick: int) -> AnyMessage:
             read_table(tick + delay)
             return message
 
-        return take_from_table
+        return read_by_table
 
-    def take(tick: int) -> AnyMessage:
+    def read_message(tick: int) -> AnyMessage:
         return read(tick + delay).message
 
-    return take
+    return read_message
 
 
 def _layout(rack: str, protocol: Protocol, case: Case) -> Layout:
@@ -199,7 +222,8 @@ def _layout(rack: str, protocol: Protocol, case: Case) -> Layout:
     )
     interrupt = None
     if protocol == "interrupt":
-        # Each reader is alone with its inbox: every message is served before the next one is sent.
+        # Each reader has its inbox to itself, because every message is served before the next one
+        # is sent.
         interrupt = InterruptSpec(
             1_000_000, 50_000, 16, due=1, ahead=1, slots=tuple(task.slot for task in tasks[1:])
         )

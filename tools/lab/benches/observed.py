@@ -1,4 +1,4 @@
-"""A rack run by a bench or an experiment, and recorded; and what is counted in its run."""
+"""Recorded runs for benches and experiments, and counts of their cycles."""
 
 from __future__ import annotations
 
@@ -15,11 +15,14 @@ from rack.tools.monitor.display import Display
 from rack.tools.recording.recording import Recording
 
 SETTLE_NS = 250_000_000
-"""Start of a run, in which caches are cold: no peer is measured in its own."""
+"""Time at the start of a run that is not measured, because caches are cold, ns.
+
+The peers are not measured at their start either.
+"""
 
 
 class Recorded(NamedTuple):
-    """How a run went, and its recording."""
+    """Result of a run, and its recording."""
 
     result: RunResult
     recording: Recording
@@ -29,9 +32,11 @@ UNVIEWED = (
     "record.keep=600",
     "supervision.max_missed_fraction=1",
 )
-"""Settings of a rack whose recording nobody looks at: a flight recorder makes no viewer's file,
-which takes a recorder of 1 kHz as long as the rest. Its lost cycles are measured, so they do not
-fail its run."""
+"""Settings of a rack whose recording is not viewed.
+
+The flight recorder writes no file for the viewer, which would double the work of a recorder at 1
+kHz. Missed cycles are measured and therefore do not fail the run.
+"""
 
 
 def record(
@@ -40,13 +45,20 @@ def record(
     folder: Path,
     share: bool = True,
 ) -> Recorded:
-    """Run a rack as `run_rack` does, which raises, record it into `folder`, and show nothing."""
+    """Run a rack as `run_rack` does, without display, and record it.
+
+    Args:
+        config: Rack to run.
+        seconds: Time of the run, s. None to run until a board ends it.
+        folder: Folder of the run.
+        share: Whether to run even on cores that another rack holds.
+    """
     result = run_rack(config, seconds, folder, Display(), share=share)
     return Recorded(result, Recording(folder))
 
 
 def endless(config: RackConfig) -> RackConfig:
-    """Return a rack that no board ends."""
+    """Return a rack in which no board ends the run."""
     boards = {
         name: board.model_copy(update={"ends_run": False}) for name, board in config.board.items()
     }
@@ -54,15 +66,15 @@ def endless(config: RackConfig) -> RackConfig:
 
 
 def with_commands(config: RackConfig, commands: Sequence[CommandConfig]) -> RackConfig:
-    """Return a rack to which an operator gives these commands, after its own."""
+    """Return a rack with additional operator commands, which follow the existing ones."""
     return config.model_copy(update={"command": (*config.command, *commands)})
 
 
 def lateness_us(recording: Recording, task: str) -> np.ndarray:
-    """Return how late each cycle started, after the start of the run, us, shape (n,).
+    """Return how late each cycle started, us, shape (n,), without the start of the run.
 
-    After skipped releases it counts from the first of them, as that of any program that has
-    overslept grid points.
+    After skipped releases the lateness counts from the first skipped one, as for any program that
+    oversleeps grid points.
     """
     rows = recording.trace(task)
     if len(rows):
@@ -72,21 +84,19 @@ def lateness_us(recording: Recording, task: str) -> np.ndarray:
 
 
 class CycleCount(NamedTuple):
-    """Cycles of tasks: how many were missed or skipped, and how many were due."""
+    """Numbers of missed or skipped cycles and of due cycles."""
 
     missed: int
     due: int
 
     @property
     def share(self) -> float:
-        """The share of those due that were missed or skipped."""
+        """Fraction of the due cycles that were missed or skipped. 0 if none was due."""
         return self.missed / self.due if self.due else 0.0
 
 
 def count_cycles(tasks: Iterable[Mapping[str, int]]) -> CycleCount:
-    """Return the cycles of several tasks or runs together; `tasks` are counts as in
-    `RunResult.tasks`.
-    """
+    """Add up the cycles of several tasks or runs, given as in `RunResult.tasks`."""
     counts = list(tasks)
     missed = sum(task["missed"] + task["skipped"] for task in counts)
     return CycleCount(missed, sum(task["due"] for task in counts))

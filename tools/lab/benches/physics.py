@@ -1,8 +1,7 @@
-"""The physics of a recorded run alone: bare `mj_step` calls with the torques that the servo level
-gave.
+"""The physics of a recorded run alone: `mj_step` calls with the torques of the servo level.
 
-They are the part of a servo cycle that no controller can leave out, so the cycle is compared with
-them. The replay must end in the recorded state, bit for bit: otherwise it was other work.
+No controller can leave out this part of a servo cycle, which makes it a baseline for the whole
+cycle. The replay must end in the recorded state, bit for bit. Otherwise it did different work.
 """
 
 from __future__ import annotations
@@ -22,21 +21,20 @@ SERVO = "servo"
 
 
 def replay(folder: Path, ticks: int) -> list[float]:
-    """Replay the longest stretch of a recorded run, without missed cycles, in which motors, not
-    brakes, moved the arm.
+    """Replay the longest stretch of a run in which motors moved the arm and no cycle was missed.
 
-    To be called by `apart`: only in the environment of boards are the physics theirs.
+    Call it by `run_in_board_environment`, because only that environment reproduces the physics of
+    boards.
 
     Args:
         folder: Folder of the run.
-        ticks: Ticks to replay, at most.
+        ticks: Maximum number of ticks to replay.
 
     Returns:
         Processor time of each tick, us.
 
     Raises:
-        Failure: If the arm never moved, or the whole stretch is replayed and does not end in the
-            recorded state.
+        Failure: If the arm never moved, or if a complete replay does not end in the recorded state.
     """
     recording = Recording(folder)
     config = recording.rack_config
@@ -44,49 +42,50 @@ def replay(folder: Path, ticks: int) -> list[float]:
     model = sleeping(cell.model, config.scene)
     first, last = _stretch(recording)
     status = f"{SERVO}.status"
-    given = recording.signal(status, "tick")
-    in_stretch = (given >= first) & (given < last)
+    command_ticks = recording.signal(status, "tick")
+    is_in_stretch = (command_ticks >= first) & (command_ticks < last)
     controls = np.zeros((last - first, model.nu))
-    controls[:, cell.actuators] = recording.signal(status, "torque")[in_stretch]
+    controls[:, cell.actuators] = recording.signal(status, "torque")[is_in_stretch]
     if cell.gripper is not None:
-        controls[:, cell.gripper.actuator] = recording.signal(status, "grip_force")[in_stretch]
+        controls[:, cell.gripper.actuator] = recording.signal(status, "grip_force")[is_in_stretch]
     data, recorded = mujoco.MjData(model), mujoco.MjData(model)
-    recorded_at = recording.signal(f"{SERVO}.state", "tick")
+    state_ticks = recording.signal(f"{SERVO}.state", "tick")
     states = recording.signal(f"{SERVO}.state", "state")
-    for each, tick in ((data, first), (recorded, last)):
-        restore_state(model, each, states[recorded_at == tick][0])
+    for target, tick in ((data, first), (recorded, last)):
+        restore_state(model, target, states[state_ticks == tick][0])
     substeps = round(config.clock_ns * 1e-9 / model.opt.timestep)
-    found: list[float] = []
+    times_us: list[float] = []
     for number, control in enumerate(controls[:ticks], first + 1):
         data.ctrl[:] = control
         start_ns = time.thread_time_ns()
         for _ in range(substeps):
             mujoco.mj_step(model, data)
-        found.append((time.thread_time_ns() - start_ns) * 1e-3)
+        times_us.append((time.thread_time_ns() - start_ns) * 1e-3)
         data.time = number * config.clock_ns * 1e-9
-    ends_alike = np.array_equal(data.qpos, recorded.qpos) and np.array_equal(
+    ends_equal = np.array_equal(data.qpos, recorded.qpos) and np.array_equal(
         data.qvel, recorded.qvel
     )
-    if len(found) == len(controls) and not ends_alike:
+    if len(times_us) == len(controls) and not ends_equal:
         raise Failure(
-            "the replayed physics do not end in the recorded state: they are not what the servo ran"
+            "the replayed physics do not end in the recorded state: the servo ran other physics"
         )
-    return found
+    return times_us
 
 
 def _stretch(recording: Recording) -> tuple[int, int]:
-    """Return first and last tick of the longest stretch without brakes; states are recorded at
-    both.
+    """Return the first and last tick of the longest stretch without brakes.
+
+    The states of the arm at both ticks are recorded.
     """
     status = f"{SERVO}.status"
     ticks = recording.signal(status, "tick")[recording.signal(status, "braked") == 0]
     stretches = np.split(ticks, np.flatnonzero(np.diff(ticks) != 1) + 1)
-    recorded = recording.signal(f"{SERVO}.state", "tick")
-    known = [np.intersect1d(stretch, recorded) for stretch in stretches]
-    ends = [(int(stretch[0]), int(stretch[-1])) for stretch in known if len(stretch)]
-    best = max(ends, key=lambda pair: pair[1] - pair[0], default=(0, 0))
-    if best[0] == best[1]:
+    state_ticks = recording.signal(f"{SERVO}.state", "tick")
+    known_ticks = [np.intersect1d(stretch, state_ticks) for stretch in stretches]
+    ends = [(int(stretch[0]), int(stretch[-1])) for stretch in known_ticks if len(stretch)]
+    longest = max(ends, key=lambda pair: pair[1] - pair[0], default=(0, 0))
+    if longest[0] == longest[1]:
         raise Failure(
-            "the arm did not move in the recorded run: no physics to replay; run it for longer"
+            "the arm did not move in the recorded run: there is nothing to replay; run it longer"
         )
-    return best
+    return longest

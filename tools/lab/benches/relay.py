@@ -1,4 +1,4 @@
-"""The emptiest boards: one sends a message in every cycle, each of the others passes it on."""
+"""Minimal boards that pass a message along a chain."""
 
 from __future__ import annotations
 
@@ -7,29 +7,29 @@ from rack.levels.level import Executor, Input, Output
 
 
 class Relayed(Status, version=1):
-    """A message that is passed on from board to board."""
+    """Message that is passed from board to board."""
 
     sent: int = field(unit="tick", doc="cycle in which the first board sent this message")
 
 
 class FirstBoard(Executor):
-    """Sends a message in every cycle."""
+    """Executor that sends a new message in every cycle."""
 
     status = Output(Relayed)
 
     def process(self, tick: int) -> None:
-        """Send."""
+        """Send a message with the tick of this cycle."""
         self.status.state = State.EXECUTING
         self.status.sent = tick
 
 
 class Relay(Executor):
-    """Passes on the message of another board, which the config wires to `message`."""
+    """Executor that passes on the message of another board, wired to `message` in the config."""
 
     message = Input(Relayed, "own.status")
     status = Output(Relayed)
 
     def process(self, tick: int) -> None:
-        """Pass it on; -1 while there is none."""
+        """Pass on the newest message, or -1 before the first one."""
         self.status.state = State.EXECUTING
         self.status.sent = self.message.message.sent if self.message.is_there else -1

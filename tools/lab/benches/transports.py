@@ -1,10 +1,9 @@
-"""Ways to bring a message from one task to others: what `rack bench mailbox` compares our mailboxes
-with.
+"""Transports that bring a message from one task to others, for comparison with our mailboxes.
 
-All are used as their users use them from Python, in their fastest form: a local message with numpy
-views of its fields is filled, its bytes are handed over, and every reader gets them into a local
-message of its own. Nothing listens on a network. Names in shared memory and in the file system are
-removed as soon as both ends are open, so that nothing is left even if the process is killed.
+All are used from Python in their fastest form. The sender fills numpy views of a local message and
+hands over its bytes, and every reader gets the bytes into its local message. Nothing listens on a
+network. Names in shared memory and in the file system are removed as soon as both ends are open,
+and nothing is left even if the process is killed.
 """
 
 from __future__ import annotations
@@ -27,8 +26,15 @@ KEY = "rack"
 
 
 class Transport(NamedTuple):
-    """Fill `message`, call `send` with a tick, then every reader with the same tick: each returns
-    what it received.
+    """An open transport with its sender and its readers.
+
+    Fill `message`, call `send` with a tick, then call every reader with the same tick. Each returns
+    the message that it received.
+
+    Attributes:
+        message: Local message of the sender.
+        send: Sends the message.
+        readers: Receive the message, one function per reader.
     """
 
     message: AnyMessage
@@ -37,8 +43,12 @@ class Transport(NamedTuple):
 
 
 class Peer(NamedTuple):
-    """A contestant: `opened` gives it for a message type and so many readers; `module` must be
-    installed for it.
+    """A contestant.
+
+    Attributes:
+        name: Name in tables.
+        module: Python module that it needs.
+        open_transport: Opens it for a message type and a number of readers.
     """
 
     name: str
@@ -48,7 +58,7 @@ class Peer(NamedTuple):
 
 @contextmanager
 def iceoryx2_blackboard(dtype: np.dtype, readers: int) -> Iterator[Transport]:
-    """Update an entry of an iceoryx2 blackboard; every reader copies its newest value."""
+    """Update an entry of an iceoryx2 blackboard. Every reader copies its newest value."""
     message = AnyMessage(dtype)
     with _iceoryx2_names() as (iceoryx2, node):
         payload = _structure(dtype)
@@ -58,35 +68,35 @@ def iceoryx2_blackboard(dtype: np.dtype, readers: int) -> Iterator[Transport]:
         )
         service = creator.add(key, payload()).max_readers(readers).create()
         writer = service.writer_builder().create()
-        own = payload.from_buffer(message.raw)
+        payload_bytes = payload.from_buffer(message.raw)
         entry = writer.entry(key, payload)
         entries = [service.reader_builder().create().entry(key, payload) for _ in range(readers)]
 
-    def fetcher(one: Any) -> Callable[[memoryview], None]:
-        get = one.get
+    def build_fetch(reader: Any) -> Callable[[memoryview], None]:
+        get = reader.get
 
         def fetch(raw: memoryview) -> None:
             raw[:] = get().data
 
         return fetch
 
-    takers = [_into(dtype, fetcher(one)) for one in entries]
-    yield Transport(message, lambda tick: entry.update_with_copy(own), takers)
+    message_readers = [_into(dtype, build_fetch(reader)) for reader in entries]
+    yield Transport(message, lambda tick: entry.update_with_copy(payload_bytes), message_readers)
 
 
 @contextmanager
 def multiprocessing_pipe(dtype: np.dtype, readers: int) -> Iterator[Transport]:
-    """Send bytes through a pipe to every reader."""
+    """Send the bytes through a pipe to each reader."""
     message = AnyMessage(dtype)
     pipes = [multiprocessing.Pipe(duplex=False) for _ in range(readers)]
 
     def send(tick: int) -> None:
-        for _, entrance in pipes:
-            entrance.send_bytes(message.raw)
+        for _, sender in pipes:
+            sender.send_bytes(message.raw)
 
     try:
         yield Transport(
-            message, send, [_into(dtype, way_out.recv_bytes_into) for way_out, _ in pipes]
+            message, send, [_into(dtype, receiver.recv_bytes_into) for receiver, _ in pipes]
         )
     finally:
         for end in (end for pipe in pipes for end in pipe):
@@ -95,8 +105,9 @@ def multiprocessing_pipe(dtype: np.dtype, readers: int) -> Iterator[Transport]:
 
 @contextmanager
 def horus_image(dtype: np.dtype, readers: int) -> Iterator[Transport]:
-    """Send a grey image of one row through a HORUS topic: no other message of it takes any number
-    of bytes.
+    """Send the bytes as a grey image of one row through a HORUS topic.
+
+    No other HORUS message carries an arbitrary number of bytes.
     """
     message = AnyMessage(dtype)
     namespace = f"rack_bench_{os.getpid()}"
@@ -114,13 +125,13 @@ def horus_image(dtype: np.dtype, readers: int) -> Iterator[Transport]:
         image.copy_from(bytes(message.raw))
         topic.send(image)
 
-    def fetcher(receive: Callable[[], Any]) -> Callable[[memoryview], None]:
+    def build_fetch(receive: Callable[[], Any]) -> Callable[[memoryview], None]:
         def fetch(raw: memoryview) -> None:
             raw[:] = np.asarray(receive()).reshape(-1).data
 
         return fetch
 
-    yield Transport(message, send, [_into(dtype, fetcher(one.recv)) for one in topics])
+    yield Transport(message, send, [_into(dtype, build_fetch(reader.recv)) for reader in topics])
 
 
 PEERS = (
@@ -131,21 +142,22 @@ PEERS = (
 
 
 def _into(dtype: np.dtype, fetch: Callable[[memoryview], object]) -> Callable[[int], AnyMessage]:
-    """Return a reader that lets `fetch` fill the bytes of a message of its own."""
+    """Build a reader with a local message, whose bytes are filled by `fetch`."""
     message = AnyMessage(dtype)
     raw = message.raw
 
-    def take(tick: int) -> AnyMessage:
+    def read_message(tick: int) -> AnyMessage:
         fetch(raw)
         return message
 
-    return take
+    return read_message
 
 
 @contextmanager
 def _iceoryx2_names() -> Iterator[tuple[Any, Any]]:
-    """Give iceoryx2 and a node to open services with: files and shared memory have names while the
-    context lasts.
+    """Open an iceoryx2 node for services.
+
+    Its files and shared memory have names only while the context lasts.
     """
     import iceoryx2
 
@@ -156,13 +168,13 @@ def _iceoryx2_names() -> Iterator[tuple[Any, Any]]:
         config.global_cfg.root_path = iceoryx2.Path.new(folder)
         config.global_cfg.prefix = iceoryx2.FileName.new(prefix)
         builder = iceoryx2.NodeBuilder.new().config(config)
-        # Signals are ours.
+        # The process handles signals itself.
         builder = builder.signal_handling_mode(iceoryx2.SignalHandlingMode.Disabled)
         try:
             yield iceoryx2, builder.create(iceoryx2.ServiceType.Ipc)
         finally:
-            for left in SHM_FOLDER.glob(f"{prefix}*"):
-                left.unlink(missing_ok=True)
+            for leftover in SHM_FOLDER.glob(f"{prefix}*"):
+                leftover.unlink(missing_ok=True)
 
 
 def _structure(dtype: np.dtype) -> type[ctypes.Structure]:

@@ -1,3 +1,1 @@
-"""The paper reproduced: experiments that are kept, claims that rest on them, and one page of
-both.
-"""
+"""Reproduction of the paper: stored experiments, the claims that rest on them, and one page."""

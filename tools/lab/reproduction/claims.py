@@ -1,5 +1,7 @@
-"""The claims of the paper, section by section: its sentence, the experiments and the rule that
-judge it, and the reason of the ruling if it holds.
+"""The claims of the paper, section by section.
+
+Each has a sentence of the paper, the experiments and the rule that judge it, and the reason for the
+ruling if it holds.
 """
 
 from __future__ import annotations
@@ -49,7 +51,16 @@ def _equation(
     settings: tuple[str, ...] = (),
     judge: Callable[[NasremRun], ClaimVerdict] | None = None,
 ) -> PaperClaim:
-    """Return an equation as a claim; it fails in this config with these settings."""
+    """Build the claim that an equation holds.
+
+    Args:
+        number: Number of the equation.
+        form: The equation.
+        quote: Sentence of the paper.
+        config: Config of a rack that violates it.
+        settings: Changes to this config, as for `--set`.
+        judge: Rule of the claim. None for the common rule.
+    """
     return PaperClaim(
         f"equation-{number}",
         f"Equation {number}: {form}",
@@ -69,16 +80,30 @@ def _system(
     judge: Callable[..., ClaimVerdict] = rules.judge_links,
     rack: str = "",
 ) -> PaperClaim:
-    """Return a claim on one of the paper's systems, judged by the messages between its sides."""
-    why = "Both sides worked together until the task was done."
-    experiments = (tasks.TASKS[rack or name],)
-    return PaperClaim(name, title, quote, why, experiments, partial(judge, rates_hz))
+    """Build a claim on one of the paper's systems, judged by the messages between its sides.
+
+    Args:
+        name: Anchor of the claim.
+        title: Heading.
+        quote: Sentence of the paper.
+        rates_hz: Rate of each mailbox between the sides, Hz.
+        judge: Rule of the claim.
+        rack: Rack that models the system. Empty if it has the name of the claim.
+    """
+    return PaperClaim(
+        name,
+        title,
+        quote,
+        "Both sides worked together until the task was done.",
+        (tasks.TASKS[rack or name],),
+        partial(judge, rates_hz),
+    )
 
 
 SYSTEMS = (NAME, tasks.STATE_TABLES, *tasks.TASKS)
-"""The racks that model systems."""
+"""Racks that model the paper's systems."""
 HURRIED = ("timing.response_ms=1000",)
-"""A response within 1 s is demanded of NASREM's four levels."""
+"""Setting that demands a response within 1 s, too short for NASREM's four levels."""
 SECTIONS = (
     Section(
         "abstract",
@@ -276,7 +301,7 @@ SECTIONS = (
                 "Background input and output",
                 "Increased time at higher levels allows slower options to execute in the"
                 " background, such as secondary data storage.",
-                "Data stored in the background made no cycle late; stored in the cycle they do.",
+                "Storing data in the background made no cycle late; storing it in the cycle does.",
                 (BEHIND.experiment, IN_LINE.experiment),
                 rules.judge_background,
             ),
@@ -367,7 +392,7 @@ SECTIONS = (
                 "X ... will range from 1 to 3 ms ... The planner runs at least 3 ms. each cycle"
                 " which implies that after two cycles 6 ms. will have been allotted to the"
                 " planner.",
-                "With the longest X both sentences exclude each other. Runs agree.",
+                "With the longest X the two sentences exclude each other. The runs confirm it.",
                 (SHORT_2.experiment, LONG_2.experiment),
                 rules.judge_sweep,
                 predictions.predict_sweep,
@@ -412,7 +437,7 @@ SECTIONS = (
                 "state-tables",
                 "The earlier controller: executors and state tables",
                 "The flow of control featured state-table transitions.",
-                "The task was done with and without a disturbance; own transitions answered it.",
+                "The task was done with and without a disturbance, which has its own transitions.",
                 (tasks.TABLES,),
                 rules.judge_tables,
             ),
@@ -429,7 +454,7 @@ SECTIONS = (
                 "context-switch",
                 "The context switch",
                 "Task-switching is approximately 100 microseconds.",
-                "NIST's boards cannot be measured any more; this machine is faster.",
+                "NIST's boards can no longer be measured; this machine is faster.",
                 (switch.SWITCH,),
                 rules.judge_switch,
             ),
@@ -445,7 +470,7 @@ SECTIONS = (
                 "Figure 5: concurrency by cycle time",
                 "Multitasking on a single processor supplies enough processing power for both the"
                 " planner and executor [at higher levels].",
-                "Slow levels do with multitasking, and fast ones do not.",
+                "Slow levels manage with multitasking, and fast ones do not.",
                 (partition.PARTITION,),
                 rules.judge_figure_5,
                 predictions.predict_figure_5,
@@ -517,7 +542,7 @@ SECTIONS = (
                 " force and motion server.",
                 {"coordinator.requests": 1, "bridge.requests": 1},
             ),
-            # The servo rack begins later: of it and of the network, four messages of five.
+            # The servo rack begins later. It and the network pass four messages of five.
             _system(
                 "brown",
                 "Brown: servo systems on a network",
@@ -550,4 +575,4 @@ SECTIONS = (
         ),
     ),
 )
-"""The sections of the page, in the paper's order."""
+"""Sections of the page, in the order of the paper."""

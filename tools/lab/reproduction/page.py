@@ -1,5 +1,6 @@
-"""The page: claims of the paper with predictions, measurements and rulings, as data, as Markdown,
-and as HTML.
+"""The page with the paper's claims, as data, as Markdown and as HTML.
+
+Each claim has predictions, measurements and a ruling.
 """
 
 from __future__ import annotations
@@ -20,8 +21,12 @@ from rack.tools.lab.reproduction.verdict import Check, ClaimVerdict, Ruling, des
 
 @dataclass(frozen=True)
 class Evidence:
-    """One thing shown for a claim: comparisons, or text of fixed width. `source` is the command
-    that it comes from.
+    """One piece of evidence for a claim: comparisons, or text of fixed width.
+
+    Attributes:
+        source: Command that produces it.
+        checks: The comparisons.
+        text: The text.
     """
 
     source: str = ""
@@ -31,7 +36,17 @@ class Evidence:
 
 @dataclass(frozen=True)
 class JudgedClaim:
-    """A claim on the page; `why` is its rule in words, or the comparisons that are not met."""
+    """A claim on the page with its ruling.
+
+    Attributes:
+        claim: Anchor on the page.
+        title: Heading.
+        quote: Sentence of the paper.
+        predicted: Evidence from configs alone.
+        measured: Evidence from experiments.
+        ruling: The ruling.
+        why: Reason for the ruling, or the comparisons that are not met.
+    """
 
     claim: str
     title: str
@@ -47,13 +62,13 @@ class PaperClaim:
     """A claim of the paper, with its experiments and its rule.
 
     Attributes:
-        name: Its anchor on the page.
-        title: Its heading.
-        quote: The paper's sentence.
-        why: The reason for its ruling if every comparison is met.
-        experiments: Experiments whose records `judge` takes, in this order.
-        judge: Its rule.
-        predict: Returns what follows from configs alone.
+        name: Anchor on the page.
+        title: Heading.
+        quote: Sentence of the paper.
+        why: Reason for the ruling if every comparison is met.
+        experiments: Experiments whose records are the arguments of `judge`, in this order.
+        judge: Rule of the claim.
+        predict: Returns the evidence that follows from configs alone.
     """
 
     name: str
@@ -65,18 +80,22 @@ class PaperClaim:
     predict: Callable[[], tuple[Evidence, ...]] = lambda: ()
 
     def judge_by(self, results: Mapping[str, Kept | str]) -> JudgedClaim:
-        """Return the claim with its ruling; a text among the `results` says why there is none."""
+        """Judge the claim by the results of its experiments.
+
+        Args:
+            results: Result of each experiment by name, or a text that tells why it has none.
+        """
         unruled = JudgedClaim(self.name, self.title, self.quote, self.predict())
-        found = []
-        for one in self.experiments:
-            result = results.get(one.name, "not run yet")
+        records = []
+        for experiment in self.experiments:
+            result = results.get(experiment.name, "not run yet")
             if isinstance(result, str):
-                return replace(unruled, why=f"{one.name}: {result}")
+                return replace(unruled, why=f"{experiment.name}: {result}")
             if result.lacking:
                 return replace(unruled, ruling=Ruling.UNTESTABLE, why=result.lacking)
-            found.append(one.record(result.found))
-        verdict = self.judge(*found)
-        charts = [Evidence(text=run.chart) for run in found if isinstance(run, Charted)]
+            records.append(experiment.record(result.found))
+        verdict = self.judge(*records)
+        charts = [Evidence(text=run.chart) for run in records if isinstance(run, Charted)]
         return replace(
             unruled,
             ruling=verdict.ruling,
@@ -90,7 +109,7 @@ C = TypeVar("C")
 
 @dataclass(frozen=True)
 class Section(Generic[C]):
-    """A section of the paper by its number, as in "3.1", or "abstract", with its claims."""
+    """A section of the paper with its claims, numbered as in "3.1", or "abstract"."""
 
     section: str
     title: str
@@ -99,14 +118,14 @@ class Section(Generic[C]):
 
 @dataclass(frozen=True)
 class Page:
-    """The whole page; `facts` are about the machine and the runs."""
+    """The whole page. The facts describe the machine and the runs."""
 
     facts: dict[str, str]
     rulings: dict[Ruling, int]
     sections: tuple[Section[JudgedClaim], ...]
 
     def document(self) -> Document:
-        """Return the page as plain data."""
+        """Convert the page to plain data."""
         return dict(TypeAdapter(Page).dump_python(self, mode="json"))
 
 
@@ -122,12 +141,12 @@ LABELS = {
 
 
 def render_markdown(page: Page) -> str:
-    """Return the page as Markdown."""
+    """Render the page as Markdown."""
     return _render("page.md.j2", page=page, labels=LABELS)
 
 
 def render_html(markdown: str) -> str:
-    """Return the page, given as Markdown, as HTML."""
+    """Render the Markdown of the page as HTML."""
     return _render("page.html.j2", body=MarkdownIt().enable("table").render(markdown))
 
 

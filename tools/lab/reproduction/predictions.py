@@ -1,4 +1,4 @@
-"""Evidence that follows from configs alone."""
+"""Predictions: evidence for claims that follows from configs alone."""
 
 from __future__ import annotations
 
@@ -13,33 +13,39 @@ from rack.tools.timing.charts import figure5
 
 
 def predict_equation(number: str, config: str, settings: tuple[str, ...]) -> tuple[Evidence, ...]:
-    """Return both sides of an equation in NASREM's rack, and in a rack in which it fails."""
+    """Return both sides of an equation for NASREM's rack and for a rack that violates it.
+
+    Args:
+        number: Number of the equation, such as "3.4".
+        config: Config of the rack that violates it.
+        settings: Changes to this config, as for `--set`.
+    """
     return _equation(number, NAME, ()), _equation(number, config, settings)
 
 
 def _equation(number: str, config: str, settings: tuple[str, ...]) -> Evidence:
-    """Return both sides by the budgets of a config, or why it is refused."""
-    source = " ".join(("rack check", config, *(f"--set {one}" for one in settings)))
+    """Return both sides of an equation by the budgets of a config, or why it is refused."""
+    source = " ".join(("rack check", config, *(f"--set {setting}" for setting in settings)))
     try:
-        found = load(config, settings)
-        verdicts = Forecast.of(rack_timing(found, wire(found))).verdicts
+        rack = load(config, settings)
+        verdicts = Forecast.of(rack_timing(rack, wire(rack))).verdicts
     except ConfigError as error:
         return Evidence(source, text=str(error))
     return Evidence(source, tuple(check_equations(v for v in verdicts if v.equation == number)))
 
 
 def predict_figure(figure: FigureRack) -> tuple[Evidence, ...]:
-    """Return a figure as the paper draws it, in letters."""
+    """Return a figure in letters, as the paper draws it."""
     return (Evidence(f"rack gantt {figure.config}", text=figure.letters(figure.panel())),)
 
 
 def predict_sweep() -> tuple[Evidence, ...]:
-    """Return what the paper says of figure 2's planner for every X that it permits."""
+    """Return the paper's statements on figure 2's planner for every permitted X."""
     checks = (check for process_ms in PAPER_X for check in check_planning(process_ms))
     return (Evidence(FIG2.config, tuple(checks)),)
 
 
 def predict_figure_5() -> tuple[Evidence, ...]:
-    """Return NASREM's levels in figure 5."""
+    """Return the place of NASREM's levels in figure 5."""
     text = "\n".join(figure5.lines(load(NAME)))
     return (Evidence(f"rack gantt {NAME} --figure 5", text=text),)

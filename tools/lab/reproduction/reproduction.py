@@ -1,6 +1,4 @@
-"""The whole reproduction: which experiments are still to be made, making them, and writing the
-page.
-"""
+"""The whole reproduction: select and make the missing experiments, and write the page."""
 
 from __future__ import annotations
 
@@ -32,28 +30,28 @@ from rack.tools.lab.reproduction.page import (
 from rack.tools.lab.reproduction.verdict import Ruling
 
 Sections = Sequence[Section[PaperClaim]]
+# Files of the page in its folder.
 HTML = "index.html"
 MARKDOWN = "README.md"
 DATA = "paper.json"
-"""Forms of the page, in its folder."""
 
 
 def select_sections(names: Sequence[str]) -> list[Section[PaperClaim]]:
-    """Return the sections of these names, all for none.
+    """Return the sections with these names, or all if no name is given.
 
     Raises:
-        Failure: No section has a name.
+        Failure: If no section has one of the names.
     """
     known = {section.section: section for section in SECTIONS}
     if unknown := [name for name in names if name not in known]:
-        raise Failure(f"--only {unknown[0]}: no such section; permitted: {', '.join(known)}", 2)
+        raise Failure(f"--only {unknown[0]}: no such section; sections: {', '.join(known)}", 2)
     return [known[name] for name in names or known]
 
 
 def list_experiments(sections: Sections) -> list[Experiment[Any]]:
-    """Return the experiments of these sections, each once."""
+    """Return the experiments of these sections without repetitions."""
     claims = (claim for section in sections for claim in section.claims)
-    return list({one.name: one for claim in claims for one in claim.experiments}.values())
+    return list({each.name: each for claim in claims for each in claim.experiments}.values())
 
 
 def reproduce(
@@ -62,12 +60,12 @@ def reproduce(
     progress: Progress,
     again: bool = False,
 ) -> Page:
-    """Make what is still to be made for these sections and write the page of all into the folder.
+    """Make the missing experiments of some sections, and write the page of all sections.
 
     Args:
-        wanted: The sections whose experiments are made.
-        workshop: Where they are made.
-        progress: What shows how far that is.
+        wanted: Sections whose experiments are made.
+        workshop: Folder and settings for the experiments.
+        progress: Shows each experiment.
         again: Whether finished experiments of these sections are repeated.
 
     Returns:
@@ -75,38 +73,38 @@ def reproduce(
     """
     workshop.prepare()
     if again:
-        for one in list_experiments(wanted):
-            (workshop.folder / KEPT / f"{one.name}.json").unlink(missing_ok=True)
+        for experiment in list_experiments(wanted):
+            (workshop.folder / KEPT / f"{experiment.name}.json").unlink(missing_ok=True)
     results: dict[str, Kept | str] = {
-        one.name: result
-        for one in list_experiments(SECTIONS)
-        if (result := kept(one, workshop.folder))
+        experiment.name: result
+        for experiment in list_experiments(SECTIONS)
+        if (result := kept(experiment, workshop.folder))
     }
-    needed = [one for one in list_experiments(wanted) if one.name not in results]
-    progress.total(sum(one.seconds for one in needed))
-    for number, one in enumerate(needed, 1):
-        progress.begin(f"{number} of {len(needed)}: {one.about}")
+    needed = [each for each in list_experiments(wanted) if each.name not in results]
+    progress.total(sum(experiment.seconds for experiment in needed))
+    for number, experiment in enumerate(needed, 1):
+        progress.begin(f"{number} of {len(needed)}: {experiment.about}")
         try:
             with as_failure():
-                result = made(one, workshop)
+                result = made(experiment, workshop)
         except Failure as error:
-            results[one.name] = str(error)
-            progress.end(one.seconds, "failed", [f"{one.name}: {error}"])
+            results[experiment.name] = str(error)
+            progress.end(experiment.seconds, "failed", [f"{experiment.name}: {error}"])
         else:
-            results[one.name] = result
-            progress.end(one.seconds, result.lacking or f"done in {result.took_s:.0f} s")
+            results[experiment.name] = result
+            progress.end(experiment.seconds, result.lacking or f"done in {result.took_s:.0f} s")
     return _write(workshop, results)
 
 
 def _write(workshop: Workshop, results: dict[str, Kept | str]) -> Page:
     """Write the page into the folder in every form, and return it."""
     facts = {name: str(value) for name, value in (machine() | {"program": program()}).items()}
-    for name, one in results.items():
-        if isinstance(one, Kept):
-            facts[name] = f"{one.made_at}, {one.took_s:g} s {one.lacking}"
+    for name, result in results.items():
+        if isinstance(result, Kept):
+            facts[name] = f"{result.made_at}, {result.took_s:g} s {result.lacking}"
     sections = tuple(
-        Section(one.section, one.title, tuple(claim.judge_by(results) for claim in one.claims))
-        for one in SECTIONS
+        Section(each.section, each.title, tuple(claim.judge_by(results) for claim in each.claims))
+        for each in SECTIONS
     )
     rulings = [claim.ruling for section in sections for claim in section.claims]
     page = Page(facts, {ruling: rulings.count(ruling) for ruling in LABELS}, sections)
@@ -118,7 +116,7 @@ def _write(workshop: Workshop, results: dict[str, Kept | str]) -> Page:
 
 
 def has_worked(page: Page, wanted: Sections) -> bool:
-    """Return whether every claim of these sections was tested, and none that should hold failed."""
+    """Return True if every claim of these sections was tested and none failed."""
     names = [section.section for section in wanted]
     return not any(
         claim.ruling in (Ruling.FAILS, Ruling.UNMADE)
@@ -129,7 +127,7 @@ def has_worked(page: Page, wanted: Sections) -> bool:
 
 
 def summarize(page: Page, folder: Path) -> list[str]:
-    """Return the page in a few lines for the terminal."""
+    """Summarise the page in a few lines for the terminal."""
     lines = [
         f"{LABELS[claim.ruling]}: {claim.title}"
         for section in page.sections

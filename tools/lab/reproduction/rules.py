@@ -1,4 +1,4 @@
-"""Rules: from the records of a claim's experiments to its verdict."""
+"""Rules that derive the verdict on a claim from the records of its experiments."""
 
 from __future__ import annotations
 
@@ -43,79 +43,84 @@ from rack.tools.lab.reproduction.verdict import (
 from rack.tools.timing.charts import figure5
 
 DONE = "task done"
-"""The end of a run that has done its task."""
+"""Reason with which a run ends when its task is done."""
 MOSTLY = 0.5
-"""Share of late cycles or plans from which on a run fails: a figure fails in all, or in none."""
+"""Share of late cycles or plans above which a run counts as failing.
+
+A figure fails in all cycles or in none, therefore the exact value does not matter.
+"""
 PAPER_X = [LEAST_X, 1.5, 2.0, 2.5, MOST_X]
-"""X of the figures, ms, over the range that the paper permits."""
+"""Values of X in the figures over the range that the paper permits, ms."""
 LEAST_P_MS = 3.0
-""""The planner runs at least 3 ms each cycle"."""
+"""Shortest time of the planner per cycle, ms: "The planner runs at least 3 ms each cycle"."""
 EXCHANGE_MS = 40.0
-"""Largest difference between two waits for an exchange: a cycle of 20 ms above, two of 10 ms on the
-network."""
+"""Largest difference between two waits for an exchange, ms.
+
+A wait lasts up to one cycle of 20 ms above, and two of 10 ms on the network.
+"""
 PAPER_HZ = {"servo": 400.0, "primitive": 50.0}
 NOMINAL = 0.01
-"""Largest relative difference of a measured rate: skipped cycles lower it."""
+"""Largest relative error of a measured rate, which skipped cycles lower."""
 FEW = 0.01
-"""Share of missed cycles or plans up to which they are stray ones."""
+"""Largest share of missed cycles or plans that counts as stray."""
 ROUNDING_MS = 1e-6
 
 
 def check_done(*runs: TaskRun) -> list[Check]:
-    """Compare the tasks that were not done with none."""
+    """Check that all tasks were done."""
     return check_none(tasks_not_done=sum(run.ended != DONE for run in runs))
 
 
 def judge_determinism(runs: Sequence[ComparedRun]) -> ClaimVerdict:
-    """Compare digests, and where runs diverge with where they first missed a deadline."""
+    """Compare digests. A run may diverge only after its first missed deadline."""
     digest = runs[0].digest
-    lockstep = [run for run in runs if run.mode == "lockstep"]
-    real = [run for run in runs if run.mode == "realtime"]
-    early = sum(
+    lockstep_runs = [run for run in runs if run.mode == "lockstep"]
+    realtime_runs = [run for run in runs if run.mode == "realtime"]
+    diverged_early = sum(
         run.difference is not None
         and (run.first_miss is None or run.first_miss > run.difference.tick)
-        for run in real
+        for run in realtime_runs
     )
-    equal = sum(run.first_miss is None and run.digest == digest for run in real)
+    equal_count = sum(run.first_miss is None and run.digest == digest for run in realtime_runs)
     return rule_on(
         *check_none(
-            lockstep_runs_that_differ=sum(run.digest != digest for run in lockstep),
-            realtime_runs_that_differ_before_a_miss=early,
+            lockstep_runs_that_differ=sum(run.digest != digest for run in lockstep_runs),
+            realtime_runs_that_differ_before_a_miss=diverged_early,
         ),
-        ideal=[compare("realtime_runs_equal", equal, ">=", 1)],
+        ideal=[compare("realtime_runs_equal", equal_count, ">=", 1)],
     )
 
 
-def judge_speedup(one: FigureRun, two: FigureRun) -> ClaimVerdict:
-    """Compare the plans of the same level on one processor and on two."""
-    alone, both = (run.tasks[PLANNER].jobs for run in (one, two))
-    needs = [compare("plans_on_one_processor", alone, ">=", 1)]
-    return rule_on(compare("plans_on_two_processors", both, ">", alone), needs=needs)
+def judge_speedup(on_one: FigureRun, on_two: FigureRun) -> ClaimVerdict:
+    """Compare the number of plans of a level on one processor and on two."""
+    plans_on_one, plans_on_two = (run.tasks[PLANNER].jobs for run in (on_one, on_two))
+    needs = [compare("plans_on_one_processor", plans_on_one, ">=", 1)]
+    return rule_on(compare("plans_on_two_processors", plans_on_two, ">", plans_on_one), needs=needs)
 
 
-def judge_growth(found: Chains) -> ClaimVerdict:
-    """Count missed cycles after boards were added: none has more to do for it."""
-    grown = found.grown
+def judge_growth(chains: Chains) -> ClaimVerdict:
+    """Count missed cycles after boards were added, which must not burden the others."""
+    grown = chains.grown
     on_time = compare("messages_on_time", grown.took.get(grown.boards, 0), ">=", 1)
     return rule_strays("cycles_missed", grown.missed, grown.due, on_time)
 
 
-def judge_locks(found: Chains) -> ClaimVerdict:
+def judge_locks(chains: Chains) -> ClaimVerdict:
     """Count missed cycles of boards that lock, read and unlock as the paper's do."""
-    return rule_strays("cycles_missed", found.locked.missed, found.locked.due)
+    return rule_strays("cycles_missed", chains.locked.missed, chains.locked.due)
 
 
-def judge_pipeline(found: Chains) -> ClaimVerdict:
+def judge_pipeline(chains: Chains) -> ClaimVerdict:
     """Compare the cycles that messages took with the number of levels."""
-    exact, real = found.lockstep.took, found.realtime.took
-    sent, arrived = sum(exact.values()), sum(real.values())
-    early = sum(count for took, count in real.items() if took < LEVELS)
-    late = arrived - early - real.get(LEVELS, 0)
-    off = sent - exact.get(LEVELS, 0)
-    # Every level may miss its part.
+    lockstep_counts, realtime_counts = chains.lockstep.took, chains.realtime.took
+    sent, arrived = sum(lockstep_counts.values()), sum(realtime_counts.values())
+    early = sum(count for took, count in realtime_counts.items() if took < LEVELS)
+    late = arrived - early - realtime_counts.get(LEVELS, 0)
+    lockstep_off = sent - lockstep_counts.get(LEVELS, 0)
+    # Each level may miss a stray share of its cycles.
     share = compare("realtime_messages_late_share", late / max(arrived, 1), "<=", LEVELS * STRAY)
     return rule_on(
-        *check_none(lockstep_messages_off=off, realtime_messages_early=early),
+        *check_none(lockstep_messages_off=lockstep_off, realtime_messages_early=early),
         ideal=check_none(realtime_messages_late=late),
         here=[share],
         needs=[compare("messages", min(arrived, sent), ">=", 1)],
@@ -123,56 +128,55 @@ def judge_pipeline(found: Chains) -> ClaimVerdict:
 
 
 def judge_replication() -> ClaimVerdict:
-    """Refuse to rule: no experiment replaces a board by a replica."""
+    """Rule that replication is untestable: no experiment replaces a board by a replica."""
     return rule_on(needs=[compare("replicas", 0, ">=", 1)])
 
 
-def judge_communication(found: NasremRun, partitions: Sequence[PartitionFigures]) -> ClaimVerdict:
-    """Compare the processor time of communication with what a second processor takes off one, ms a
-    second.
+def judge_communication(run: NasremRun, partitions: Sequence[PartitionFigures]) -> ClaimVerdict:
+    """Compare the processor time of communication with the time that a second processor saves.
+
+    Both are in ms per second.
     """
-    communication = sum(task.communication_us / task.slice_ms for task in found.executors.values())
-    loads = {one.partition: one.loads.values() for one in partitions}
-    one, two = (loads[Partition("tight", cores)] for cores in (1, 2))
-    saved = 1e3 * (sum(one) - max(two))
-    return rule_on(compare("communication_ms_per_s", communication, "<", saved))
+    communication = sum(task.communication_us / task.slice_ms for task in run.executors.values())
+    loads = {each.partition: each.loads.values() for each in partitions}
+    one_core, two_cores = (loads[Partition("tight", cores)] for cores in (1, 2))
+    saved_ms = 1e3 * (sum(one_core) - max(two_cores))
+    return rule_on(compare("communication_ms_per_s", communication, "<", saved_ms))
 
 
-def judge_flow(found: NasremRun) -> ClaimVerdict:
-    """Compare the commands and statuses of the levels with what the ticks of their writers
-    demand.
-    """
-    ways = [[box for box in found.due if box.endswith(way)] for way in (".command", ".status")]
+def judge_flow(run: NasremRun) -> ClaimVerdict:
+    """Compare the number of commands and statuses with the number of their writers' cycles."""
+    ways = [[box for box in run.due if box.endswith(way)] for way in (".command", ".status")]
     boxes = [box for way in ways for box in way]
-    # A run may end before the last one is written.
-    lacking = sum(max(0, found.due[box] - 1 - found.messages[box]) for box in boxes)
-    used = sum(any(found.messages[box] for box in way) for way in ways)
-    due = sum(found.due[box] for box in boxes)
-    return rule_strays("messages_lacking", lacking, due, compare("ways", used, "=", len(ways)))
+    # A run may end before the last message is written.
+    missing = sum(max(0, run.due[box] - 1 - run.messages[box]) for box in boxes)
+    used_ways = sum(any(run.messages[box] for box in way) for way in ways)
+    due = sum(run.due[box] for box in boxes)
+    return rule_strays("messages_lacking", missing, due, compare("ways", used_ways, "=", len(ways)))
 
 
-def judge_loop(found: NasremRun) -> ClaimVerdict:
-    """Compare the cycles that missed their bound with all."""
-    tasks = found.executors.values()
+def judge_loop(run: NasremRun) -> ClaimVerdict:
+    """Compare the number of missed cycles with the number of all cycles."""
+    tasks = run.executors.values()
     bad = sum(task.missed for task in tasks)
     return rule_strays("cycles_missed", bad, sum(task.cycles for task in tasks))
 
 
 def judge_losses(*runs: LossesRun) -> ClaimVerdict:
-    """Compare when each loss was detected and over with its bounds."""
+    """Compare the times of detection and recovery of each loss with their bounds."""
     faults = [fault for run in runs for fault in run.faults]
-    lacking = check_none(
+    failures = check_none(
         not_detected_in_bound=sum(not fault.is_within for fault in faults),
         not_recovered_in_bound=sum(not fault.is_recovered for fault in faults),
         tasks_not_done=sum(not run.worked for run in runs),
     )
-    struck = sum(fault.struck >= 0 for fault in faults)
-    return rule_on(compare("losses", struck, "=", len(faults)), *lacking)
+    struck_count = sum(fault.struck >= 0 for fault in faults)
+    return rule_on(compare("losses", struck_count, "=", len(faults)), *failures)
 
 
-def judge_goto(found: GotoRuns) -> ClaimVerdict:
-    """Compare when A was done with the time by which it was promised, s."""
-    early, met = found.early, found.met
+def judge_goto(runs: GotoRuns) -> ClaimVerdict:
+    """Compare the time at which A was done with the promised time, s."""
+    early, met = runs.early, runs.met
     begun = early.moved + (early.done_s is not None)
     done_s = inf if met.done_s is None else met.done_s
     promised = compare("done_as_promised_s", done_s, "<=", met.by_s or 0.0)
@@ -180,35 +184,37 @@ def judge_goto(found: GotoRuns) -> ClaimVerdict:
 
 
 def check_equations(verdicts: Iterable[EquationVerdict]) -> list[Check]:
-    """Compare both sides of an equation for every subject, in ms where they are times."""
+    """Compare both sides of an equation for every subject. Times are in ms."""
     checks = []
-    for one in verdicts:
-        scale = MS if one.unit == "ns" else 1.0
-        name = f"{one.subject}: {one.meaning}"
-        checks.append(compare(name, one.left * scale, one.sign, one.right * scale))
+    for verdict in verdicts:
+        scale = MS if verdict.unit == "ns" else 1.0
+        name = f"{verdict.subject}: {verdict.meaning}"
+        checks.append(compare(name, verdict.left * scale, verdict.sign, verdict.right * scale))
     return checks
 
 
-def judge_equation(number: str, found: NasremRun) -> ClaimVerdict:
-    """Compare both sides in the worst cycle of every subject; within bounds, in 99 of 100
-    cycles.
+def judge_equation(number: str, run: NasremRun) -> ClaimVerdict:
+    """Compare both sides of an equation in the worst cycle of every subject.
+
+    Within bounds it holds in 99 of 100 cycles.
     """
-    verdicts = [one for one in found.verdicts if one.measured.equation == number]
+    verdicts = [each for each in run.verdicts if each.measured.equation == number]
     return rule_on(
-        ideal=check_equations(one.measured for one in verdicts),
-        here=check_none(failing_in_1_of_100_cycles=sum(not one.mostly for one in verdicts)),
+        ideal=check_equations(each.measured for each in verdicts),
+        here=check_none(failing_in_1_of_100_cycles=sum(not each.mostly for each in verdicts)),
         needs=[compare("subjects", len(verdicts), ">=", 1)],
     )
 
 
-def judge_sum(found: NasremRun) -> ClaimVerdict:
-    """Compare the longest responses with the sum alone, ms; within bounds, with the sum and its
-    waits, which a missed cycle may prolong.
+def judge_sum(run: NasremRun) -> ClaimVerdict:
+    """Compare the longest responses with the sum of equation 3.3, ms.
+
+    Within bounds the sum includes waits, and responses may be prolonged by missed cycles.
     """
-    assert found.response is not None, "it is a hierarchy"
-    ways = found.response.ways
+    assert run.response is not None, "it is a hierarchy"
+    ways = run.response.ways
     checks = [
-        compare(f"{name}_ms", way.longest_ms, "<=", found.response.sum_eq_3_3_ms)
+        compare(f"{name}_ms", way.longest_ms, "<=", run.response.sum_eq_3_3_ms)
         for name, way in ways.items()
         if way.longest_ms is not None
     ]
@@ -220,86 +226,90 @@ def judge_sum(found: NasremRun) -> ClaimVerdict:
     )
 
 
-def judge_background(behind: FigureRun, in_line: FigureRun) -> ClaimVerdict:
-    """Count the cycles that are late while a level stores data in the background, and compare with
-    storing in the cycle.
-    """
+def judge_background(background: FigureRun, in_cycle: FigureRun) -> ClaimVerdict:
+    """Compare the late cycles while a level stores data in the background and in its cycle."""
     return rule_on(
-        compare("blocks_stored", behind.tasks[PLANNER].jobs, ">=", 1),
-        compare("stored_in_cycle_late_share", in_line.late(LEVEL), ">=", MOSTLY),
-        ideal=check_none(cycles_late=behind.tasks[LEVEL].late),
-        here=[compare("cycles_late_share", behind.late(LEVEL), "<=", STRAY)],
+        compare("blocks_stored", background.tasks[PLANNER].jobs, ">=", 1),
+        compare("stored_in_cycle_late_share", in_cycle.late(LEVEL), ">=", MOSTLY),
+        ideal=check_none(cycles_late=background.tasks[LEVEL].late),
+        here=[compare("cycles_late_share", background.late(LEVEL), "<=", STRAY)],
     )
 
 
-def judge_loose(plain: NetworkRun, later: NetworkRun) -> ClaimVerdict:
-    """Compare the servo rack's cycles, and when it responds to the machine above, with a network
-    and with a slower one.
-    """
+def judge_loose(normal: NetworkRun, slower: NetworkRun) -> ClaimVerdict:
+    """Compare the servo rack's cycles and response on a network and on a slower one."""
     later_ms = 0.0
-    if plain.response_ms is not None and later.response_ms is not None:
-        later_ms = later.response_ms - plain.response_ms
-    missed = max(plain.servo_missed, later.servo_missed)
+    if normal.response_ms is not None and slower.response_ms is not None:
+        later_ms = slower.response_ms - normal.response_ms
+    missed = max(normal.servo_missed, slower.servo_missed)
     return rule_on(
-        *check_done(plain, later),
+        *check_done(normal, slower),
         compare("response_off_expected_ms", abs(later_ms - LATER_MS), "<=", EXCHANGE_MS),
         ideal=check_none(servo_missed_share=missed),
         here=[compare("servo_missed_share", missed, "<=", STRAY)],
     )
 
 
-def judge_waits(found: Waits) -> ClaimVerdict:
-    """Compare how late cycles start after polling, and after blocking, us."""
-    return rule_on(compare("polling_late_median_us", found.polling_us, "<", found.blocking_us))
+def judge_waits(waits: Waits) -> ClaimVerdict:
+    """Compare the lateness of cycles after polling and after blocking, us."""
+    return rule_on(compare("polling_late_median_us", waits.polling_us, "<", waits.blocking_us))
 
 
-def judge_update(found: FigureRun) -> ClaimVerdict:
-    """Count the updates of a plan during which the executor began, of all that its release met."""
-    return rule_strays("updates_preempted", found.preempted, found.met)
+def judge_update(run: FigureRun) -> ClaimVerdict:
+    """Count the plan updates that were preempted, of those in which the executor was released."""
+    return rule_strays("updates_preempted", run.preempted, run.met)
 
 
 def judge_both(*runs: FigureRun) -> ClaimVerdict:
-    """Compare the executors' late cycles with all, in runs in which planners made plans."""
+    """Compare the executors' late cycles with all cycles of runs in which planners made plans."""
     late = sum(run.tasks[LEVEL].late for run in runs)
     due = sum(run.tasks[LEVEL].jobs for run in runs)
     plans = min(run.tasks[PLANNER].jobs for run in runs)
     return rule_strays("cycles_late", late, due, compare("plans", plans, ">=", 1))
 
 
-def _compare_late(found: FigureRun, sign: str, name: str = "late_share") -> Check:
-    """Compare the larger share of late cycles and of late plans with `MOSTLY`."""
-    return compare(name, max(found.late(LEVEL), found.late(PLANNER)), sign, MOSTLY)
+def _compare_late(run: FigureRun, sign: str, name: str = "late_share") -> Check:
+    """Compare the larger of the shares of late cycles and late plans with `FAILING_SHARE`."""
+    return compare(name, max(run.late(LEVEL), run.late(PLANNER)), sign, MOSTLY)
 
 
-def _undisturbed(found: FigureRun) -> list[Check]:
-    """Return what a run needs to show the figure: an executor is late in almost all cycles, or in
-    none.
+def _undisturbed(run: FigureRun) -> list[Check]:
+    """Return the condition under which a run can show a figure.
+
+    An executor is late in almost all cycles or in almost none. Anything between is a disturbance.
     """
-    late = found.late(LEVEL)
-    return [compare("executor_late_share", late, "<=", STRAY)] if late <= MOSTLY else []
+    late_share = run.late(LEVEL)
+    return [compare("executor_late_share", late_share, "<=", STRAY)] if late_share <= MOSTLY else []
 
 
-def judge_working(found: FigureRun) -> ClaimVerdict:
-    """Rule on a figure of which the paper says that it works."""
-    late = check_none(late=sum(count.late for count in found.tasks.values()))
-    return rule_on(ideal=late, here=[_compare_late(found, "<=")], needs=_undisturbed(found))
+def judge_working(run: FigureRun) -> ClaimVerdict:
+    """Judge a figure that works according to the paper."""
+    late = check_none(late=sum(count.late for count in run.tasks.values()))
+    return rule_on(ideal=late, here=[_compare_late(run, "<=")], needs=_undisturbed(run))
 
 
-def judge_failing(found: FigureRun, *shorter: FigureRun) -> ClaimVerdict:
-    """Rule on a figure of which the paper says that it fails, with the shortest X that the paper
-    permits too.
+def judge_failing(paper_run: FigureRun, *shorter: FigureRun) -> ClaimVerdict:
+    """Judge a figure that fails according to the paper.
+
+    Args:
+        paper_run: Run of the figure.
+        shorter: Runs with the shortest X that the paper permits. They should fail as well.
     """
     shortest = [_compare_late(run, ">", "shortest_X_late_share") for run in shorter]
-    return rule_on(_compare_late(found, ">"), ideal=shortest, needs=_undisturbed(found))
+    return rule_on(_compare_late(paper_run, ">"), ideal=shortest, needs=_undisturbed(paper_run))
 
 
 def check_planning(process_ms: float) -> tuple[Check, Check]:
-    """Compare figure 2 with this X, ms, with both sentences on its planner: at least `LEAST_P_MS`
-    in each cycle, and a plan in the cycles permitted.
+    """Compare figure 2 at one X with both sentences of the paper on its planner.
+
+    The planner runs at least `MIN_PLAN_MS` in each cycle, and plans within the permitted cycles.
+
+    Args:
+        process_ms: X, ms.
     """
     config = load(FIG2.config, settings_of(FIG2.config, process_ms))
     level = rack_timing(config, wire(config)).level(LEVEL)
-    # As the pattern "RXWPU" reads, U too is in every cycle; for a plan to be done, it is once.
+    # By the pattern "RXWPU" each cycle contains U, but a whole plan needs U only once.
     each_ms = (level.residual_ns - level.update_ns) * MS
     work_ns = (level.plan_ns or 0) + level.update_ns
     cycles = ceil(work_ns / level.residual_ns) if level.residual_ns > 0 else inf
@@ -311,55 +321,58 @@ def check_planning(process_ms: float) -> tuple[Check, Check]:
 
 
 def judge_sweep(short: FigureRun, long: FigureRun) -> ClaimVerdict:
-    """Compare two sentences of the paper with each other, by computation and by two runs."""
-    odd = sum(bool(describe_unmet(check_planning(process_ms))) for process_ms in PAPER_X)
+    """Compare two sentences of the paper with each other, by computation and in two runs."""
+    count = sum(bool(describe_unmet(check_planning(process_ms))) for process_ms in PAPER_X)
     return rule_on(
-        compare("contradicting_X", odd, ">=", 1),
+        compare("contradicting_X", count, ">=", 1),
         _compare_late(short, "<=", "shortest_X_late_share"),
         _compare_late(long, ">", "longest_X_late_share"),
         holding=Ruling.CONTRADICTS,
     )
 
 
-def judge_tables(found: TableRuns) -> ClaimVerdict:
+def judge_tables(runs: TableRuns) -> ClaimVerdict:
     """Compare the state transitions of runs with and without a disturbance."""
-    answering = {*found.disturbed.rows} - {*found.undisturbed.rows}
+    answering_rows = {*runs.disturbed.rows} - {*runs.undisturbed.rows}
     return rule_on(
-        *check_done(found.disturbed, found.undisturbed),
-        compare("answering_transitions", len(answering), ">=", 1),
+        *check_done(runs.disturbed, runs.undisturbed),
+        compare("answering_transitions", len(answering_rows), ">=", 1),
     )
 
 
-def judge_levels(found: NasremRun) -> ClaimVerdict:
-    """Compare the rates of the levels with the paper's, or else with the config's, and the gaps
-    between their cycles with two periods: from there on a cycle was left out.
+def judge_levels(run: NasremRun) -> ClaimVerdict:
+    """Compare the rates of the levels and the gaps between their cycles with nominal values.
+
+    The nominal rate is the paper's, or else the config's. A gap of two periods or more means that a
+    cycle was left out.
     """
     config = load(NAME)
-    rates = check_done(found)
+    rates = check_done(run)
     gaps = []
-    for name, task in found.executors.items():
+    for name, task in run.executors.items():
         every = config.every(name)
-        own_hz = 1e9 / (every * config.clock_ns)
-        rate_hz = own_hz * task.done / -(-found.ticks // every)
-        nominal_hz = PAPER_HZ.get(name, own_hz)
-        off = abs(rate_hz / nominal_hz - 1.0)
-        rates.append(compare(f"{name}_off_{nominal_hz:g}_Hz_share", off, "<=", NOMINAL))
+        config_hz = 1e9 / (every * config.clock_ns)
+        rate_hz = config_hz * task.done / -(-run.ticks // every)
+        nominal_hz = PAPER_HZ.get(name, config_hz)
+        rate_error = abs(rate_hz / nominal_hz - 1.0)
+        rates.append(compare(f"{name}_off_{nominal_hz:g}_Hz_share", rate_error, "<=", NOMINAL))
         gaps.append(compare(f"{name}_gap_ms", task.largest_gap_ms, "<", 2.0 * task.slice_ms))
     return rule_on(*rates, ideal=gaps)
 
 
-def judge_switch(found: SwitchRun) -> ClaimVerdict:
-    """Compare this machine's switch with the paper's, and with what the config assumes, us."""
+def judge_switch(run: SwitchRun) -> ClaimVerdict:
+    """Compare this machine's context switch with the paper's and with the config's, us."""
     return rule_on(
-        compare("switch_median_us", found.switch_us["p50"], "<=", PAPER_US),
-        compare("switch_p99_us", found.switch_us["p99"], "<=", found.assumed_us),
+        compare("switch_median_us", run.switch_us["p50"], "<=", PAPER_US),
+        compare("switch_p99_us", run.switch_us["p99"], "<=", run.assumed_us),
         holding=Ruling.BOUNDED,
     )
 
 
-def judge_figure_5(found: Sequence[PartitionFigures]) -> ClaimVerdict:
-    """Compare what levels miss by partition: do slow levels do with multitasking, and do fast ones
-    need more?
+def judge_figure_5(partitions: Sequence[PartitionFigures]) -> ClaimVerdict:
+    """Compare the missed cycles of levels by partition.
+
+    Slow levels should manage with multitasking, and fast ones should need separate processors.
     """
     is_slow = {
         one.level: figure5.region_of(one.cycle_s).name == "multitasking"
@@ -367,29 +380,34 @@ def judge_figure_5(found: Sequence[PartitionFigures]) -> ClaimVerdict:
     }
     tasks = [
         ("slow" if is_slow.get(task.board) else one.partition.coupling, task)
-        for one in found
+        for one in partitions
         for task in one.tasks
     ]
 
     def missed_share(group: str) -> float:
-        own = [task for name, task in tasks if name == group]
-        bad = sum(task.missed + task.skipped for task in own)
-        return bad / max(sum(task.cycles for task in own), 1)
+        group_tasks = [task for name, task in tasks if name == group]
+        bad = sum(task.missed + task.skipped for task in group_tasks)
+        return bad / max(sum(task.cycles for task in group_tasks), 1)
 
-    most = missed_share("loose") + FEW
+    max_missed = missed_share("loose") + FEW
     plans = min((task.cycles for _, task in tasks if task.role == "planner"), default=0)
     return rule_on(
         compare("slow_levels_missed_share", missed_share("slow"), "<=", FEW),
-        ideal=[compare("fast_levels_missed_share", missed_share("tight"), ">", most)],
+        ideal=[compare("fast_levels_missed_share", missed_share("tight"), ">", max_missed)],
         needs=[compare("fewest_plans", plans, ">=", 1)],
     )
 
 
-def judge_systems(names: Iterable[str], *found: TaskRun | TableRuns) -> ClaimVerdict:
-    """Compare the responses in whole tasks of these systems with their bounds, ms; a missed cycle
-    may prolong them.
+def judge_systems(names: Iterable[str], *records: TaskRun | TableRuns) -> ClaimVerdict:
+    """Compare the responses in whole tasks of some systems with their bounds, ms.
+
+    Within bounds they may be prolonged by missed cycles.
+
+    Args:
+        names: Names of the systems.
+        records: Record of each system's whole task.
     """
-    runs = [run.disturbed if isinstance(run, TableRuns) else run for run in found]
+    runs = [run.disturbed if isinstance(run, TableRuns) else run for run in records]
     ways = {
         f"{name}_{way}_ms": response
         for name, run in zip(names, runs, strict=True)
@@ -408,7 +426,7 @@ def judge_systems(names: Iterable[str], *found: TaskRun | TableRuns) -> ClaimVer
 
 
 def judge_layers(names: Iterable[str]) -> ClaimVerdict:
-    """Count levels in configs, and the systems in which a level is faster than one below it."""
+    """Count levels in configs, and systems in which a level is faster than one below it."""
     configs = {name: load(name) for name in names}
     paths = {name: rack_timing(one, wire(one)).hierarchy for name, one in configs.items()}
     faster = sum(sorted(path.cycles, reverse=True) != [*path.cycles] for path in paths.values())
@@ -417,57 +435,58 @@ def judge_layers(names: Iterable[str]) -> ClaimVerdict:
 
 
 def judge_links(
-    rates_hz: Mapping[str, int], found: TaskRun, ideal: Sequence[Check] = ()
+    rates_hz: Mapping[str, int], run: TaskRun, ideal: Sequence[Check] = ()
 ) -> ClaimVerdict:
-    """Compare what passed between the sides of a system with what its rates demand.
+    """Compare the messages between the sides of a system with the number that its rates demand.
 
     Args:
-        rates_hz: Messages a second of each mailbox; 1 for at least one message.
-        found: The whole task of the system.
-        ideal: What it takes to hold, too; without it, it holds within bounds.
+        rates_hz: Rate of each mailbox, Hz. 1 demands at least one message.
+        run: Whole task of the system.
+        ideal: Further comparisons for the claim to hold. Without them it holds within bounds.
     """
-    least = {
-        box: (1.0 - STRAY) * rate_hz * found.lasted_s if rate_hz > 1 else 1
+    min_counts = {
+        box: (1.0 - STRAY) * rate_hz * run.lasted_s if rate_hz > 1 else 1
         for box, rate_hz in rates_hz.items()
     }
     return rule_on(
-        *check_done(found),
-        compare("missed_share", found.missed, "<=", STRAY),
+        *check_done(run),
+        compare("missed_share", run.missed, "<=", STRAY),
         *(
-            compare(f"{box}_messages", found.messages.get(box, 0), ">=", count)
-            for box, count in least.items()
+            compare(f"{box}_messages", run.messages.get(box, 0), ">=", count)
+            for box, count in min_counts.items()
         ),
         ideal=ideal,
     )
 
 
-def judge_rccl(rates_hz: Mapping[str, int], found: TaskRun) -> ClaimVerdict:
-    """Judge RCCL's links as others; for it to hold, every joint has a processor, too."""
+def judge_rccl(rates_hz: Mapping[str, int], run: TaskRun) -> ClaimVerdict:
+    """Judge RCCL's links. For the claim to hold, every joint also needs a processor."""
     joints = [task.core for task in wire(load("rccl")).tasks if task.board.startswith("joint")]
     cores = compare("processors_of_joints", len(set(joints)), ">=", len(joints))
-    return judge_links(rates_hz, found, [cores])
+    return judge_links(rates_hz, run, [cores])
 
 
-def judge_predictable(found: ResponseRun) -> ClaimVerdict:
-    """Compare responses with the tick predicted, and with equations 3.2 and 3.3; within bounds,
-    with the longest that the grid permits instead of the sum of eq. 3.3.
+def judge_predictable(run: ResponseRun) -> ClaimVerdict:
+    """Compare responses with the predicted tick and with equations 3.2 and 3.3.
+
+    Within bounds the longest response that the grid permits replaces the sum of equation 3.3.
     """
-    real = found.realtime
-    upper, total = (
+    realtime = run.realtime
+    upper_checks, sum_checks = (
         [
             compare(f"{row['level']}_within_{bound}", row["max_from_reading_ms"], "<=", row[bound])
-            for row in real.rows()
+            for row in realtime.rows()
             if row["commands"]
         ]
         for bound in ("bound_eq_3_2_ms", "sum_eq_3_3_ms")
     )
     return rule_on(
         *check_none(
-            lockstep_off_predicted_tick=len(found.lockstep.off),
-            lockstep_torque_off_predicted_tick=found.differs != found.predicted,
-            realtime_beyond_grid=len(real.beyond),
+            lockstep_off_predicted_tick=len(run.lockstep.off),
+            lockstep_torque_off_predicted_tick=run.differs != run.predicted,
+            realtime_beyond_grid=len(realtime.beyond),
         ),
-        *upper,
-        ideal=total,
-        needs=[compare("realtime_commands", len(real.measured), ">=", 1)],
+        *upper_checks,
+        ideal=sum_checks,
+        needs=[compare("realtime_commands", len(realtime.measured), ">=", 1)],
     )

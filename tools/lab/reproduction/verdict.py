@@ -1,6 +1,4 @@
-"""Verdicts: comparisons of measured values with what a claim demands, and the ruling that results
-from them alone.
-"""
+"""Verdicts: comparisons of measured with demanded values, and the rulings that follow from them."""
 
 from __future__ import annotations
 
@@ -10,7 +8,10 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 STRAY = 0.02
-"""Share of missed cycles, plans or messages up to which this machine is blamed, not the claim."""
+"""Largest share of missed cycles, plans or messages that is attributed to this machine.
+
+Up to this share the claim still holds within bounds.
+"""
 COMPARISONS = {
     "<": operator.lt,
     "<=": operator.le,
@@ -21,7 +22,7 @@ COMPARISONS = {
 
 
 class Ruling(StrEnum):
-    """The outcome of a claim."""
+    """Outcome of a claim."""
 
     HOLDS = "holds"
     BOUNDED = "bounded"
@@ -33,7 +34,15 @@ class Ruling(StrEnum):
 
 @dataclass(frozen=True)
 class Check:
-    """One comparison. `compared` names the quantity, and its unit if it has one."""
+    """One comparison of a measured with a demanded value.
+
+    Attributes:
+        compared: Name of the quantity, with its unit if it has one.
+        measured: Measured value.
+        sign: Key of `COMPARISONS`.
+        demanded: Value on the right of the sign.
+        met: Whether the comparison is true.
+    """
 
     compared: str
     measured: float
@@ -46,26 +55,33 @@ class Check:
 
 
 def compare(name: str, measured: float, sign: str, demanded: float) -> Check:
-    """Compare a value with what is demanded of it; `sign` is one of `COMPARISONS`."""
+    """Compare a measured value with a demanded one.
+
+    Args:
+        name: Name of the quantity, with its unit if it has one.
+        measured: Measured value.
+        sign: Key of `COMPARISONS`.
+        demanded: Value on the right of the sign.
+    """
     is_met = bool(COMPARISONS[sign](measured, demanded))
     return Check(name, float(measured), sign, float(demanded), is_met)
 
 
 def describe_unmet(checks: Iterable[Check]) -> str:
-    """Return the comparisons that are not met as text, empty if all are."""
+    """Format the comparisons that are not met. Empty if all are met."""
     return "; ".join(str(check) for check in checks if not check.met)
 
 
 @dataclass(frozen=True)
 class ClaimVerdict:
-    """A ruling with the comparisons from which it results."""
+    """A ruling with the comparisons from which it follows."""
 
     ruling: Ruling
     checks: tuple[Check, ...]
 
 
 def check_none(**counts: float) -> list[Check]:
-    """Compare counts of what must not happen with 0."""
+    """Check that the counts of unwanted events are 0."""
     return [compare(name, count, "=", 0) for name, count in counts.items()]
 
 
@@ -80,13 +96,13 @@ def rule_on(
 
     Args:
         always: Comparisons that the claim demands on every machine.
-        ideal: Further ones, which the disturbances of this machine may spoil.
-        here: What is demanded instead of the ideal ones for the claim to hold within bounds.
-        needs: What a run must show before the claim is judged by it.
-        holding: The ruling if the claim is met.
+        ideal: Further comparisons, which disturbances of this machine may spoil.
+        here: Comparisons that replace the ideal ones for the claim to hold within bounds.
+        needs: Conditions without which a run cannot test the claim.
+        holding: Ruling if the claim is met.
 
     Returns:
-        The ruling with every comparison, each once.
+        The ruling with every comparison, without repetitions.
     """
     if describe_unmet(needs):
         ruling = Ruling.UNTESTABLE
@@ -100,7 +116,14 @@ def rule_on(
 
 
 def rule_strays(name: str, bad: int, due: int, *needs: Check) -> ClaimVerdict:
-    """Rule on something that must not happen; within bounds if at most a stray share did."""
+    """Rule on an event that must not happen. A stray share is tolerated within bounds.
+
+    Args:
+        name: Name of the event.
+        bad: Number of times that it happened.
+        due: Number of times that it could have happened.
+        needs: Conditions without which a run cannot test the claim.
+    """
     return rule_on(
         ideal=[compare(name, bad, "=", 0)],
         here=[compare(f"{name}_share", bad / max(due, 1), "<=", STRAY)],

@@ -1,5 +1,6 @@
-"""Figure 5 of the paper, as text and picture: the kind of concurrency that suits the cycle of each
-level of a rack.
+"""Figure 5 of the paper, as text and picture.
+
+It shows the kind of concurrency that suits the cycle of each level of a rack.
 """
 
 from __future__ import annotations
@@ -17,9 +18,9 @@ from rack.tools.timing.tables import merge_rows
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+# Range of the axis.
 SHORTEST_S = 3e-5
 LONGEST_S = 1e3
-"""Range of the axis."""
 TICKS = {
     1e-4: "0.1 ms",
     1e-3: "1 ms",
@@ -29,22 +30,27 @@ TICKS = {
     10.0: "10 s",
     60.0: "1 min",
 }
-"""Labels of the axis, s."""
+"""Labels of the axis by cycle, s."""
 BANDS = ("#DDDDDD", "#F4C7B5", "#BFE3D8", "#C9DDF0")
-"""From the fastest region to the slowest (light tints of Paul Tol's colours)."""
+"""Colours from the fastest region to the slowest, light tints of Paul Tol's palette."""
 EDGE = "#222222"
 MARKERS = {"tight": ("s", EDGE), "loose": ("s", "white"), "none": ("x", EDGE)}
 MEANINGS = {
     "tight": "planner on its executor's processor",
-    "loose": "planner on its own",
+    "loose": "planner on a separate processor",
     "none": "no planner",
 }
 
 
 @dataclass(frozen=True)
 class Region:
-    """A region of implementation: cycles up to `to_s`, s, its name in the figure, and the place it
-    gives a planner.
+    """A region of implementation.
+
+    Attributes:
+        name: Short name.
+        to_s: Longest cycle, s.
+        words: Name in the figure.
+        asks: Place that the figure demands for a planner.
     """
 
     name: str
@@ -58,22 +64,30 @@ REGIONS = (
         "fine-grained",
         1e-3,
         "fine-grained multiprocessing or dedicated hardware",
-        "hardware of its own",
+        "dedicated hardware",
     ),
-    Region("asynchronous", 0.25, "asynchronous multiprocessing", "a processor of its own"),
+    Region("asynchronous", 0.25, "asynchronous multiprocessing", "a separate processor"),
     Region("multitasking", 60.0, "multitasking", "a task on the executor's processor"),
-    Region("distributed", float("inf"), "distributed processing, on a LAN", "a machine of its own"),
+    Region("distributed", float("inf"), "distributed processing, on a LAN", "a separate machine"),
 )
-"""By cycle: "under 1 ms", "250 ms", "seconds", "minutes". A bound belongs to the faster region,
-except 1 ms."""
+"""Regions by cycle: "under 1 ms", "250 ms", "seconds", "minutes".
+
+A bound belongs to the faster region, except 1 ms.
+"""
 COUPLING = {"tight": "multitasking", "loose": "asynchronous"}
-"""The region of each coupling in the figure."""
+"""Short name of the region in which the figure has each coupling."""
 
 
 @dataclass(frozen=True)
 class Placed:
-    """A level in the figure: its cycle, s, the region of that cycle, its coupling, and a remark on
-    both.
+    """A level in the figure.
+
+    Attributes:
+        level: Name of the level.
+        cycle_s: Cycle, s.
+        region: Region of this cycle.
+        coupling: Coupling of its planner.
+        remark: Comparison of the coupling with the region.
     """
 
     level: str
@@ -84,7 +98,7 @@ class Placed:
 
 
 def placed(config: RackConfig) -> list[Placed]:
-    """Return the levels of a rack with their regions, the fastest first."""
+    """Return the levels of a rack with their regions, beginning with the fastest one."""
     tick_s = config.tick_ns * 1e-9
     cycles = {name: config.every(name) * tick_s for name in config.board}
     return [
@@ -97,9 +111,7 @@ def placed(config: RackConfig) -> list[Placed]:
 
 
 def together(levels: Sequence[Placed]) -> list[Placed]:
-    """Return the levels, those of the same place in the figure as one: a board a joint needs one
-    line.
-    """
+    """Merge levels at the same place in the figure, because boards per joint need only one line."""
     return [Placed(**row) for row in merge_rows(map(vars, levels), "level")]
 
 
@@ -112,9 +124,7 @@ def region_of(cycle_s: float) -> Region:
 
 def lines(config: RackConfig) -> Iterator[str]:
     """Yield the figure as text: every level with the kind of concurrency that suits it."""
-    yield (
-        f"figure 5: the levels of {config.name} among the regions of implementation, by their cycle"
-    )
+    yield f"figure 5: levels of {config.name} in the regions of implementation, by their cycles"
     yield ""
     yield from (
         f"{level.level}, {duration(level.cycle_s)}: {level.remark}"
@@ -123,7 +133,7 @@ def lines(config: RackConfig) -> Iterator[str]:
 
 
 def document(config: RackConfig) -> Document:
-    """Return the figure as plain data; the last region has no end."""
+    """Return the figure as plain data. The last region has no end."""
     regions = [
         {"name": r.words, "to_s": None if r.to_s == float("inf") else r.to_s} for r in REGIONS
     ]
@@ -136,14 +146,14 @@ def document(config: RackConfig) -> Document:
 
 
 def duration(cycle_s: float) -> str:
-    """Return a cycle with a suitable unit."""
+    """Format a cycle with a suitable unit."""
     if cycle_s >= 60.0:
         return f"{cycle_s / 60.0:g} min"
     return f"{cycle_s:g} s" if cycle_s >= 1.0 else f"{cycle_s * 1e3:g} ms"
 
 
 def save(config: RackConfig, stem: Path) -> list[Path]:
-    """Draw the figure with the levels of a rack into `stem`.png and .svg; return their paths."""
+    """Draw the figure with the levels of a rack into `stem`.png and .svg. Returns their paths."""
     levels = together(placed(config))
     paths = paths_of(stem)
     with picture(paths, 9.0, 1.7 + 0.36 * len(levels), layout="constrained") as figure:
@@ -192,14 +202,15 @@ def _draw_levels(axes: Axes, levels: Sequence[Placed]) -> None:
 
 
 def _remark(region: Region, coupling: str) -> str:
+    """Return a remark on a coupling in a region."""
     if coupling == "none":
         return "no planner to couple"
-    here = f"coupled {coupling}ly"
+    actual = f"coupled {coupling}ly"
     if COUPLING[coupling] == region.name:
-        return f"{here}, as in the figure"
+        return f"{actual}, as in the figure"
     asked = f"the figure gives the planner {region.asks}"
     if region.name == "asynchronous":
-        return f"{asked}; here it is {here}, which is enough while eqs 3.8 and 3.10 hold"
+        return f"{asked}; here it is {actual}, which is enough while eqs 3.8 and 3.10 hold"
     if region.name == "multitasking":
-        return f"{asked}; here it is {here}, at the cost of another processor"
-    return f"{asked}; here it is {here}"
+        return f"{asked}; here it is {actual}, at the cost of another processor"
+    return f"{asked}; here it is {actual}"

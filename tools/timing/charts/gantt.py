@@ -1,4 +1,4 @@
-"""A Gantt chart of a config or of a run: its panels as text, as plain data and as a picture."""
+"""A Gantt chart of a config or of a run, as text, as plain data and as a picture."""
 
 from __future__ import annotations
 
@@ -24,7 +24,14 @@ NO_BUDGET = (
 
 @dataclass(frozen=True)
 class Subject:
-    """A config with its layout, and the run that had it, if any; `folder` is for the pictures."""
+    """The config, or the run, of which a chart is made.
+
+    Attributes:
+        config: Config of the rack.
+        layout: Layout of its segment.
+        run: The run. None for a config.
+        folder: Folder for the pictures.
+    """
 
     config: RackConfig
     layout: Layout
@@ -33,10 +40,16 @@ class Subject:
 
 
 def subject_of(text: str, settings: Sequence[str], out: Path | None) -> Subject:
-    """Return the subject named by `text`: the folder of a run, else a config by name or path, with
-    `settings`.
+    """Find the folder of a run, or else a config by name or path.
 
-    Raises `Failure` and `ConfigError`.
+    Args:
+        text: Folder, name or path.
+        settings: Changes to the config, as for `--set`.
+        out: Folder for the pictures. None for the default.
+
+    Raises:
+        Failure: If there is no such run, or settings are given for a run.
+        ConfigError: If the config is not valid.
     """
     path = Path(text)
     if path.is_dir() and ("/" in text or (path / "cycles.parquet").is_file()):
@@ -45,14 +58,14 @@ def subject_of(text: str, settings: Sequence[str], out: Path | None) -> Subject:
         run = TracedRun(Recording(path))
         return Subject(run.config, run.recording.layout, run, out or path)
     if "/" in text and not path.exists():
-        raise Failure(f"{text}: no such run's folder, and no such config", 2)
+        raise Failure(f"{text}: there is no run folder and no config of this name", 2)
     config = load(text, settings)
     return Subject(config, wire(config), None, out or RUNS / f"{config.name}-gantt")
 
 
 @dataclass(frozen=True)
 class Gantt:
-    """Panels of one window of time, the measurement above the schedule, and notes on them."""
+    """Panels of one window of time, with notes. The measurement precedes the schedule."""
 
     rack: str
     panels: tuple[Panel, ...]
@@ -65,20 +78,20 @@ class Gantt:
         return sum(len(panel.chart.spans) for panel in self.panels)
 
     def text(self) -> str:
-        """Return the chart as text."""
+        """Format the chart as text."""
         panels = [
             f"{self.rack}: " + "\n".join(lines(panel, self.column_ns)) for panel in self.panels
         ]
         return "\n\n".join([*panels, *self.notes])
 
     def document(self) -> Document:
-        """Return the chart as plain data."""
+        """Convert the chart to plain data."""
         panels = [panel.document() for panel in self.panels]
         return {"rack": self.rack, "panels": panels, "notes": list(self.notes)}
 
     def save(self, folder: Path) -> list[Path]:
-        """Draw the chart into `folder`, which must exist; return the paths of the pictures."""
-        # matplotlib takes a second to import.
+        """Draw the chart into an existing folder, and return the paths of the pictures."""
+        # Import this only for pictures, because matplotlib takes a second.
         from rack.tools.timing.charts.picture import save
 
         return save(self.panels, self.rack, folder / "gantt")
@@ -90,10 +103,16 @@ def gantt_of(
     process_ns: Mapping[str, Sequence[int]],
     progress: Callable[[float], None],
 ) -> Gantt:
-    """Return the chart of a subject. Raises `Failure`.
+    """Build the chart of a subject.
 
-    `process_ns` are times of X in a schedule, cycle by cycle, by board. `progress` takes the part
-    of a run read so far.
+    Args:
+        subject: Config or run.
+        options: Window for which the user asks.
+        process_ns: Times of X in the schedule by board, ns, cycle by cycle.
+        progress: Receives the fraction of a run that has been read.
+
+    Raises:
+        Failure: If the subject has no chart, or not in this window.
     """
     name = subject.config.name
     run = subject.run
@@ -111,11 +130,11 @@ def gantt_of(
         else:
             schedule.on_cores_of(run.recording.layout)
     else:
-        still = f"{name} ran in lockstep: time stood still while its tasks computed"
+        no_run = f"{name} ran in lockstep: time stood still while its tasks computed"
         if schedule is None:
-            raise Failure(f"{name}: {NO_BUDGET}" if run is None else f"{still}; {NO_BUDGET}", 2)
+            raise Failure(f"{name}: {NO_BUDGET}" if run is None else f"{no_run}; {NO_BUDGET}", 2)
         if run is not None:
-            notes.append(f"{still}; only the schedule is shown")
+            notes.append(f"{no_run}; only the schedule is shown")
         start, end = options.window(shown_task(schedule.tasks), None, 0, schedule.shown_ns)
     if schedule is not None:
         panels.append(schedule.panel(start, end))

@@ -1,5 +1,6 @@
-"""A Gantt chart in letters, as in the paper's figures: a row for each lane, a unit function in each
-column.
+"""A Gantt chart in letters, as in the paper's figures.
+
+It has a row for each lane, and each column shows a unit function.
 """
 
 from __future__ import annotations
@@ -14,20 +15,20 @@ from rack.tools.timing.charts.panel import Panel
 from rack.tools.timing.charts.patterns import IDLE, Lane
 
 OTHER = "."
-"""Another board has the core."""
+"""Sign of a column in which another board has the core."""
 COLUMNS = 100
-"""Most columns of a chart."""
+"""Maximum number of columns of a chart."""
 CYCLE_COLUMNS = 4
-"""Fewest columns of a cycle whose start is marked."""
+"""Minimum number of columns of a cycle for its start to be marked."""
 LABEL_COLUMNS = 6
 REPEATED = 3
-"""Most equal cycles in a row that are written one by one."""
+"""Maximum number of equal successive cycles that are written individually."""
 SHOWN = 4
-"""Most patterns, and late jobs, in a list."""
+"""Maximum number of patterns or late jobs in a list."""
 
 
 def lines(panel: Panel, column_ns: int) -> Iterator[str]:
-    """Yield a panel as text."""
+    """Yield the lines of a panel."""
     chart = panel.chart
     yield (
         f"{panel.kind}, {ms(chart.start_ns)} to {ms(chart.end_ns)} ms, a column is"
@@ -60,37 +61,36 @@ def lines(panel: Panel, column_ns: int) -> Iterator[str]:
 
 
 def column_for(window_ns: int, shortest_ns: int | None) -> int:
-    """Return the time of a column, ns: 1, 2 or 5 times a power of ten; it shows the shortest part
-    if possible.
+    """Return the time of a column, ns: 1, 2 or 5 times a power of ten.
+
+    If `shortest_ns` is given and long enough, a column is no longer than that.
     """
     steps: list[int] = [digit * 10**power for power in range(3, 12) for digit in (1, 2, 5)]
     fits = next((step for step in steps if window_ns <= COLUMNS * step), steps[-1])
-    seen = max(
+    fine = max(
         (step for step in steps if shortest_ns is not None and step <= shortest_ns), default=fits
     )
-    return max(fits, seen)
+    return max(fits, fine)
 
 
 def _row(chart: Chart, lane: Lane, column_ns: int) -> str:
-    """Return the letters of a lane: in each column the unit function that took most of it."""
+    """Return the letters of a lane, in each column the unit function that took most of it."""
     columns = -(-(chart.end_ns - chart.start_ns) // column_ns)
     shares: list[Counter[str]] = [Counter() for _ in range(columns)]
     for span in (span for span in chart.spans if span.core == lane.core):
         letter = span.unit.value if span.task in lane.tasks else OTHER
         start, end = span.start_ns - chart.start_ns, span.end_ns - chart.start_ns
-        for at in range(start // column_ns, -(-end // column_ns)):
-            begin = at * column_ns
-            shares[at][letter] += min(end, begin + column_ns) - max(start, begin)
+        for column in range(start // column_ns, -(-end // column_ns)):
+            column_start = column * column_ns
+            shares[column][letter] += min(end, column_start + column_ns) - max(start, column_start)
     for share in shares:
-        # Added last, it loses to a letter with as much of the column.
+        # Idle is added last and loses to a letter with the same share of the column.
         share[IDLE] = column_ns - share.total()
     return "".join(max(share, key=share.__getitem__) for share in shares)
 
 
 def _marks(panel: Panel, lane: Lane, column_ns: int) -> str:
-    """Return "|" where cycles begin and "!" where a deadline was missed; empty when there are
-    none.
-    """
+    """Return a row with "|" at starts of cycles and "!" at missed deadlines. Empty without any."""
     chart = panel.chart
     row = [" "] * (-(-(chart.end_ns - chart.start_ns) // column_ns) + 1)
     if lane.cycle_ns >= CYCLE_COLUMNS * column_ns:
@@ -103,7 +103,7 @@ def _marks(panel: Panel, lane: Lane, column_ns: int) -> str:
 
 
 def label_row(labels: Iterable[tuple[int, str]]) -> str:
-    """Return a row with labels that begin at these columns, or after the label before them."""
+    """Return a row of labels, each of which begins at its column or after the previous label."""
     row = ""
     for column, label in labels:
         row = row.ljust(column) + label
@@ -111,8 +111,14 @@ def label_row(labels: Iterable[tuple[int, str]]) -> str:
 
 
 def numbered_frames(panel: Panel, character_ns: int, prefix: str = "|") -> list[tuple[int, int]]:
-    """Return numbers and starts, ns, of the minor frames to be labelled: far enough apart for
-    `prefix` and number.
+    """Return numbers and starts of the minor frames to be labelled, ns.
+
+    Their distance is sufficient for the labels.
+
+    Args:
+        panel: Panel with minor frames.
+        character_ns: Time that a character takes on the axis, ns.
+        prefix: Text of a label before the number.
     """
     frames = panel.frames
     widest_ns = max(len(f"{prefix}{number}") for number in frames) * character_ns
@@ -122,7 +128,7 @@ def numbered_frames(panel: Panel, character_ns: int, prefix: str = "|") -> list[
 
 
 def label_times(panel: Panel, column_ns: int) -> range:
-    """Return the times to write along the axis, ns: far enough apart for their numbers."""
+    """Return the times to write along the axis, ns, with sufficient distance for the numbers."""
     chart = panel.chart
     columns = 0
     widest = LABEL_COLUMNS
@@ -135,8 +141,9 @@ def label_times(panel: Panel, column_ns: int) -> range:
 
 
 def step_for(panel: Panel, narrowest_ns: int) -> int:
-    """Return the time between two labels of the axis, ns: the cycle of a lane if not too short nor
-    too long.
+    """Return the time between two labels of the axis, ns.
+
+    It is the cycle of a lane, unless all cycles are too short or too long.
     """
     longest_ns = (panel.chart.end_ns - panel.chart.start_ns) // 2
     cycles = sorted(lane.cycle_ns for lane in panel.lanes)
@@ -145,29 +152,36 @@ def step_for(panel: Panel, narrowest_ns: int) -> int:
 
 
 def _patterns(panel: Panel) -> Iterator[str]:
-    """Yield the patterns of every lane, the most frequent first."""
+    """Yield the patterns of every lane, beginning with the most frequent one."""
     for lane in panel.lanes:
-        found = panel.patterns.get(lane.name)
-        if found is None:
+        lane_patterns = panel.patterns.get(lane.name)
+        if lane_patterns is None:
             continue
-        rest = "cycles without a plan" if lane.is_tight else "cycles"
-        for counts, of in ((found.plans, "plans"), (found.cycles, rest)):
+        cycles_name = "cycles without a plan" if lane.is_tight else "cycles"
+        for counts, kind in ((lane_patterns.plans, "plans"), (lane_patterns.cycles, cycles_name)):
             if counts:
-                yield from _counted(lane.name, counts, of)
+                yield from _counted(lane.name, counts, kind)
 
 
-def _counted(name: str, counts: Counter[str], of: str) -> Iterator[str]:
+def _counted(name: str, counts: Counter[str], kind: str) -> Iterator[str]:
+    """Yield the most frequent patterns with their counts.
+
+    Args:
+        name: Name of the lane.
+        counts: Number of occurrences of each pattern.
+        kind: Name of the counted units, "plans" or "cycles".
+    """
     ranked = counts.most_common()
-    (first, count), *others = ranked[:SHOWN]
+    (top, count), *others = ranked[:SHOWN]
     margin = " " * len(name)
-    yield f"{name}: {_short(first)}: {count} of {counts.total()} {of}"
+    yield f"{name}: {_short(top)}: {count} of {counts.total()} {kind}"
     yield from (f"{margin}  {_short(pattern)}: {number}" for pattern, number in others)
     if hidden := ranked[SHOWN:]:
         yield f"{margin}  and {len(hidden)} more patterns: {sum(n for _, n in hidden)}"
 
 
 def _short(pattern: str) -> str:
-    """Return a pattern with long rows of equal cycles written once."""
+    """Shorten a pattern: long rows of equal cycles are written once."""
     runs = [(cycle, len(list(equal))) for cycle, equal in groupby(pattern.split(" | "))]
     return " | ".join(
         " | ".join([cycle] * n) if n <= REPEATED else f"({cycle}) x {n}" for cycle, n in runs
@@ -175,20 +189,21 @@ def _short(pattern: str) -> str:
 
 
 def _late(panel: Panel) -> Iterator[str]:
-    """Yield the number of late jobs by task, with the first ones of the window."""
+    """Yield the number of late jobs of each task, with the first ones of the window."""
     for lane in panel.lanes:
         for task in lane.tasks:
             count = panel.counts.get(task)
             if count is None or not count.late:
                 continue
-            what = "plans" if task == lane.planner else "cycles"
+            kind = "plans" if task == lane.planner else "cycles"
             skipped = f", {count.skipped} of them skipped" if count.skipped else ""
             late = [job for job in panel.late(lane) if job.task == task]
-            yield f"late: {task}: {count.late} of {count.jobs} {what}{skipped}"
+            yield f"late: {task}: {count.late} of {count.jobs} {kind}{skipped}"
             yield from (f"  {_story(job)}" for job in late[:SHOWN])
 
 
 def _story(job: Job) -> str:
+    """Describe the release, deadline and end of a late job."""
     due = f"released at {ms(job.release_ns)} ms, due at {ms(job.deadline_ns)} ms"
     if job.end_ns is None:
         return f"{due}: not done by then"

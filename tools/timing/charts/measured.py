@@ -1,5 +1,6 @@
-"""The Gantt chart of a run, from its trace: spans of unit functions, cut where a higher priority
-had the core.
+"""The Gantt chart of a run, from its trace.
+
+Spans of unit functions are cut where a task of higher priority had the core.
 """
 
 from __future__ import annotations
@@ -20,13 +21,14 @@ from rack.tools.timing.charts.panel import Count, Panel, union, without
 from rack.tools.timing.charts.patterns import Detail, Lane, Patterns, Stretch, lanes_of, patterns
 
 BLOCK_NS = 1_000_000_000
-"""Time of a run that is read at once, so that memory does not grow with its length."""
+"""Time of a run that is read at once, ns. It keeps memory independent of the run's length."""
 
 
 class TracedRun:
-    """A recorded run in the terms of the timing model. Times are ns of the wall clock since tick 0.
+    """A recorded run in terms of the timing model. Times are ns of the wall clock since tick 0.
 
-    Raises `ConfigError` when a file named by its config is missing.
+    Raises:
+        ConfigError: If a file named by the config of the run is missing.
     """
 
     def __init__(self, recording: Recording) -> None:
@@ -34,71 +36,78 @@ class TracedRun:
         self.config: RackConfig = recording.rack_config
         layout = recording.layout
         known = rack_timing(self.config, layout, dict.fromkeys(self.config.board, Budget())).tasks
-        # The cores that the run obtained; the clock leaves no trace.
+        # Use the cores that the run obtained. The clock leaves no trace.
         self.tasks = tuple(
             replace(t, core=layout.task(t.name).core) for t in known if t.role != "clock"
         )
 
     @property
     def is_lockstep(self) -> bool:
-        """Whether time stood still while tasks computed: such a run has no chart."""
+        """Whether time stood still while tasks computed. Such a run has no chart."""
         return self.config.clock.mode == "lockstep"
 
     def panel(self, start_ns: int, end_ns: int, progress: Callable[[float], None]) -> Panel:
-        """Return the panel of a window; `progress` takes the part of the run that is read."""
+        """Build the panel of a window.
+
+        Args:
+            start_ns: Start of the window, ns.
+            end_ns: End of the window, ns.
+            progress: Receives the fraction of the run that has been read.
+        """
         lanes = lanes_of(self.tasks)
         details = {lane.name: Detail.measured(lane, self._medians(lane)) for lane in lanes}
-        found = {lane.name: Patterns.none() for lane in lanes}
+        counted = {lane.name: Patterns.none() for lane in lanes}
         counts = {task.name: Count() for task in self.tasks}
-        reach = max(task.period_ns for task in self.tasks)
-        block = max(BLOCK_NS, 2 * reach)
-        for at in range(0, self.end_ns, block):
-            until = min(at + block, self.end_ns)
-            chart = self.chart(at, until + reach)
+        longest_period = max(task.period_ns for task in self.tasks)
+        block_length = max(BLOCK_NS, 2 * longest_period)
+        for start in range(0, self.end_ns, block_length):
+            end = min(start + block_length, self.end_ns)
+            chart = self.chart(start, end + longest_period)
             for lane in lanes:
-                found[lane.name].add(patterns(chart, lane, (at, until), details[lane.name]))
+                counted[lane.name].add(patterns(chart, lane, (start, end), details[lane.name]))
             for task, count in counts.items():
-                counts[task] = count + Count.of(chart, task, at, until)
-            progress(until / self.end_ns)
-        return Panel("measured", self.chart(start_ns, end_ns), lanes, found, counts)
+                counts[task] = count + Count.of(chart, task, start, end)
+            progress(end / self.end_ns)
+        return Panel("measured", self.chart(start_ns, end_ns), lanes, counted, counts)
 
     def _medians(self, lane: Lane) -> dict[Unit, int]:
-        """Return the median of each unit function of a lane, preemption included, ns."""
-        found = {}
+        """Return the median time of each unit function of a lane, including preemption, ns."""
+        medians_ns = {}
         for task in (task for task in self.tasks if task.name in lane.tasks):
             rows, _ = self._records[task.name]
             for unit, start, end in UNITS[task.role]:
-                found[unit] = int(np.median(rows[end] - rows[start])) if len(rows) else 0
-        return found
+                medians_ns[unit] = int(np.median(rows[end] - rows[start])) if len(rows) else 0
+        return medians_ns
 
     def middle_ns(self, task: TimedTask) -> int:
-        """Return the first release of a task, or of its plans, in the second half of the run; 0
-        without one.
+        """Return the first release of a task, or of its plans, in the second half of the run, ns.
+
+        0 if there is none.
         """
         ticks = self._records[task.name][0]["tick"]
-        at = int(np.searchsorted(ticks, self.end_ns // self.config.tick_ns // 2))
-        return int(ticks[at]) * self.config.tick_ns if at < len(ticks) else 0
+        index = int(np.searchsorted(ticks, self.end_ns // self.config.tick_ns // 2))
+        return int(ticks[index]) * self.config.tick_ns if index < len(ticks) else 0
 
     @cached_property
     def end_ns(self) -> int:
-        """The end of the last cycle traced."""
+        """End of the last traced cycle, ns."""
         traces = self.recording.cycles.items()
         layout = self.recording.layout
-        lasts = [
+        end_ticks = [
             int(rows["tick"][-1]) + layout.task(task).every for task, rows in traces if len(rows)
         ]
-        return max(lasts, default=0) * self.config.tick_ns
+        return max(end_ticks, default=0) * self.config.tick_ns
 
     def chart(self, start_ns: int, end_ns: int) -> Chart:
-        """Return the chart of the time from `start_ns` to `end_ns`."""
+        """Build the chart of the time from `start_ns` to `end_ns`."""
         traced = [
             _Traced(task, self._cut(task, start_ns, end_ns), self.config.tick_ns)
             for task in self.tasks
         ]
         spans: list[Span] = []
         for core in {task.core for task in self.tasks}:
-            spans += _spans([found for found in traced if found.task.core == core])
-        jobs = [job for found in traced for job in found.jobs()]
+            spans += _spans([each for each in traced if each.task.core == core])
+        jobs = [job for each in traced for job in each.jobs()]
         whole = Chart(
             start_ns=0,
             end_ns=self.end_ns,
@@ -108,54 +117,55 @@ class TracedRun:
         return whole.window(start_ns, end_ns)
 
     def _cut(self, task: TimedTask, start_ns: int, end_ns: int) -> np.ndarray:
-        """Return the trace records of a task that extend into a stretch of time."""
+        """Return the trace records of a task that overlap a stretch of time."""
         rows, longest_ns = self._records[task.name]
-        # A skipped release is in the record of the next one.
+        # A skipped release is noted in the record of the next one.
         bounds = (
             (start_ns - longest_ns) // self.config.tick_ns,
             (end_ns + task.every_ns) // self.config.tick_ns + 1,
         )
         first, last = np.searchsorted(rows["tick"], bounds).tolist()
-        found: np.ndarray = rows[first:last]
-        return found
+        selected: np.ndarray = rows[first:last]
+        return selected
 
     @cached_property
     def _records(self) -> dict[str, tuple[np.ndarray, int]]:
-        """The records of every task, only those of plans for a planner, and its longest response,
-        ns.
+        """Trace records and longest response of every task, ns.
+
+        A planner has only those of plans.
         """
-        found = {}
+        records = {}
         for task in self.tasks:
             rows = self.recording.trace(task.name)
             rows = plans(rows) if task.role == "planner" else rows
-            found[task.name] = rows, max(response_ns(rows).tolist(), default=0)
-        return found
+            records[task.name] = rows, max(response_ns(rows).tolist(), default=0)
+        return records
 
 
 @dataclass(frozen=True)
 class _Traced:
-    """The trace of one task, with the length of a tick on the wall clock."""
+    """Trace of one task, with the length of a tick on the wall clock, ns."""
 
     task: TimedTask
     rows: np.ndarray
     tick_ns: int
 
     def jobs(self) -> Iterator[Job]:
-        """Yield its jobs; a release that an executor skipped is a job that was never done."""
+        """Yield the jobs. A release that an executor skipped is a job without an end."""
         every = self.task.every_ns
         period = self.task.period_ns
-        left_out = skipped(self.rows) * (self.task.role == "executor")
+        skipped_counts = skipped(self.rows) * (self.task.role == "executor")
         for release, count, end in zip(
-            self._at("release_ns"), left_out.tolist(), self._at("end_ns"), strict=True
+            self._at("release_ns"), skipped_counts.tolist(), self._at("end_ns"), strict=True
         ):
-            for missing in range(count, 0, -1):
+            for before in range(count, 0, -1):
                 yield Job(
-                    self.task.name, release - missing * every, release - (missing - 1) * every, None
+                    self.task.name, release - before * every, release - (before - 1) * every, None
                 )
             yield Job(self.task.name, release, release + period, end)
 
     def units(self) -> Iterator[tuple[int, Unit, Stretch]]:
-        """Yield release, unit function and time of everything it computed."""
+        """Yield the release, unit function and stretch of every computation."""
         for unit, *borders in UNITS[self.task.role]:
             stamps = map(self._at, ("release_ns", *borders))
             for release, start, end in zip(*stamps, strict=True):
@@ -163,36 +173,38 @@ class _Traced:
                     yield release, unit, (start, end)
 
     def waking(self) -> Iterator[Stretch]:
-        """Yield the times before its cycles in which it already had the processor, to wake up."""
+        """Yield the stretches before cycles in which the task had the processor to wake up."""
         took = waking_ns(self.rows).tolist()
         yield from (
             (start - ns, start) for start, ns in zip(self._at("start_ns"), took, strict=True) if ns
         )
 
-    def _at(self, moment: str) -> list[int]:
-        # Relative to its own release: ticks count from 0, the machine's clock from anything.
-        found: list[int] = (
-            self.rows["tick"] * self.tick_ns + self.rows[moment] - self.rows["release_ns"]
+    def _at(self, stamp: str) -> list[int]:
+        # Compute times from the release, because the origin of the machine's clock is arbitrary.
+        """Return the times of a stamp in all records, ns since tick 0."""
+        times_ns: list[int] = (
+            self.rows["tick"] * self.tick_ns + self.rows[stamp] - self.rows["release_ns"]
         ).tolist()
-        return found
+        return times_ns
 
 
 def _spans(traced: Sequence[_Traced]) -> Iterator[Span]:
-    """Yield the spans of one core by falling priority, each without the time taken by those above
-    it.
+    """Yield the spans of one core by descending priority.
+
+    Time that tasks of higher priority took is cut out.
     """
     levels: dict[tuple[int, bool], list[tuple[TimedTask, int, Unit, Stretch]]] = defaultdict(list)
     waking: dict[int, list[Stretch]] = defaultdict(list)
-    for found in traced:
-        task = found.task
-        for release, unit, stretch in found.units():
-            # A critical section runs at its ceiling: equal priorities cannot preempt it, but it
-            # starts after them.
+    for trace in traced:
+        task = trace.task
+        for release, unit, stretch in trace.units():
+            # A critical section runs at its ceiling. Tasks of equal priority cannot preempt it, but
+            # it starts after them.
             is_locked = unit is Unit.UPDATE and task.ceiling > task.priority
             priority = task.ceiling if is_locked else task.priority
             levels[-priority, is_locked].append((task, release, unit, stretch))
         if task.role == "executor":
-            waking[-task.priority] += found.waking()
+            waking[-task.priority] += trace.waking()
     busy: list[Stretch] = []
     for level, is_locked in sorted(levels):
         taken: list[Stretch] = []

@@ -1,5 +1,6 @@
-"""A chart with its lanes, late jobs and patterns: of a schedule, or as measured; and the arithmetic
-of stretches.
+"""A chart with its lanes, late jobs and patterns, of a schedule or as measured.
+
+It also has functions for sets of stretches.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ NS_PER_MS = 1_000_000
 
 @dataclass(frozen=True)
 class Count:
-    """Number of jobs of one task, and of late ones; `skipped` of the late ones never began."""
+    """Number of jobs of a task and of late ones. The skipped ones among them never began."""
 
     jobs: int = 0
     late: int = 0
@@ -26,10 +27,17 @@ class Count:
 
     @classmethod
     def of(cls, chart: Chart, task: str, start_ns: int, end_ns: int) -> Count:
-        """Return the count of the jobs that were released from `start_ns` to `end_ns`."""
+        """Count the jobs that were released from `start_ns` up to `end_ns`.
+
+        Args:
+            chart: Chart that contains the jobs.
+            task: Task to count.
+            start_ns: Start of the time, ns.
+            end_ns: End of the time, ns, not included.
+        """
         releases = [job.release_ns for job in chart.jobs if job.task == task]
         late = [job for job in chart.late(task) if start_ns <= job.release_ns < end_ns]
-        # The newest one may still be running.
+        # The newest job may still be running and does not count as skipped.
         skipped = sum(job.end_ns is None and job.release_ns < releases[-1] for job in late)
         return cls(sum(start_ns <= release < end_ns for release in releases), len(late), skipped)
 
@@ -41,8 +49,13 @@ class Count:
 class Panel:
     """A chart cut to a window of time, with its lanes.
 
-    `patterns` by lane, and `counts` by task, cover the whole run, or a longer schedule. `frame_ns`
-    is the minor frame of a static schedule; 0: there is none.
+    Attributes:
+        kind: "schedule" or "measured".
+        chart: Spans and jobs in the window.
+        lanes: Rows of the chart.
+        patterns: Patterns by lane, over the whole run or a longer schedule.
+        counts: Jobs by task, over the same time.
+        frame_ns: Minor frame of a static schedule, ns. 0 if there is none.
     """
 
     kind: Literal["schedule", "measured"]
@@ -54,9 +67,7 @@ class Panel:
 
     @property
     def frames(self) -> dict[int, int]:
-        """The start of every minor frame that begins in the window, ns, by number from the start of
-        the run.
-        """
+        """Start of every minor frame that begins in the window, ns, by its number in the run."""
         if not self.frame_ns:
             return {}
         numbers = range(
@@ -65,10 +76,10 @@ class Panel:
         return {number: number * self.frame_ns for number in numbers}
 
     def late(self, lane: Lane) -> list[Job]:
-        """Return the jobs of a lane that were late in the window, by deadline."""
-        found = [job for task in lane.tasks for job in self.chart.late(task)]
+        """Return the jobs of a lane that were late in the window, sorted by deadline."""
+        late_jobs = [job for task in lane.tasks for job in self.chart.late(task)]
         return sorted(
-            (job for job in found if job.deadline_ns <= self.chart.end_ns),
+            (job for job in late_jobs if job.deadline_ns <= self.chart.end_ns),
             key=lambda job: job.deadline_ns,
         )
 
@@ -80,7 +91,7 @@ class Panel:
         yield from without((self.chart.start_ns, self.chart.end_ns), busy)
 
     def document(self) -> Document:
-        """Return everything as plain data; times are ms."""
+        """Convert the panel to plain data, with times in ms."""
         late = {job for lane in self.lanes for job in self.late(lane)}
         return {
             "kind": self.kind,
@@ -114,7 +125,7 @@ class Panel:
                 for job in self.chart.jobs
             ],
             "patterns": {
-                lane: {of: dict(counts.most_common()) for of, counts in found._asdict().items()}
+                lane: {kind: dict(counts.most_common()) for kind, counts in found._asdict().items()}
                 for lane, found in self.patterns.items()
             },
             "counts": {task: vars(count) for task, count in self.counts.items()},
@@ -122,6 +133,7 @@ class Panel:
 
 
 def _in_ms(entry: Span | Job | Lane, *names: str) -> dict[str, float | None]:
+    """Return some times of an entry by name, in ms."""
     times = {name: getattr(entry, f"{name}_ns") for name in names}
     return {
         f"{name}_ms": None if time_ns is None else time_ns / NS_PER_MS
@@ -130,24 +142,24 @@ def _in_ms(entry: Span | Job | Lane, *names: str) -> dict[str, float | None]:
 
 
 def without(stretch: Stretch, busy: Sequence[Stretch]) -> Iterator[Stretch]:
-    """Yield the parts of a stretch that are not in `busy`, a `union`."""
+    """Yield the parts of a stretch that are not in `busy`, which is sorted and without overlaps."""
     start, end = stretch
-    for at in range(bisect_right(busy, start, key=lambda taken: taken[1]), len(busy)):
-        if busy[at][0] >= end:
+    for index in range(bisect_right(busy, start, key=lambda entry: entry[1]), len(busy)):
+        if busy[index][0] >= end:
             break
-        if busy[at][0] > start:
-            yield start, busy[at][0]
-        start = busy[at][1]
+        if busy[index][0] > start:
+            yield start, busy[index][0]
+        start = busy[index][1]
     if start < end:
         yield start, end
 
 
 def union(stretches: Iterable[Stretch]) -> list[Stretch]:
-    """Return the union of the stretches, in order, without overlaps."""
-    found: list[Stretch] = []
+    """Return the union of the stretches, sorted and without overlaps."""
+    merged: list[Stretch] = []
     for start, end in sorted(stretches):
-        if found and start <= found[-1][1]:
-            found[-1] = found[-1][0], max(found[-1][1], end)
+        if merged and start <= merged[-1][1]:
+            merged[-1] = merged[-1][0], max(merged[-1][1], end)
         else:
-            found.append((start, end))
-    return found
+            merged.append((start, end))
+    return merged

@@ -1,7 +1,7 @@
-"""Lanes, the rows of a Gantt chart, and their patterns: the order of unit functions in the cycles
-of a plan.
+"""Lanes, the rows of a Gantt chart, and their patterns.
 
-A pattern is written as in the paper: "R X W P | R X W P U -".
+A pattern is the order of unit functions in the cycles of a plan, written as in the paper:
+"R X W P | R X W P U -".
 """
 
 from __future__ import annotations
@@ -18,25 +18,37 @@ from rack.boards.timing.schedule import Chart, Span
 from rack.boards.timing.tasks import TimedTask, Unit
 
 Stretch = tuple[int, int]
-"""Start and end, ns."""
+"""Start and end of a stretch of time, ns."""
 IDLE = "-"
 SHORT = 0.02
-"""Part of a cycle below which a measured stretch may be a remnant, of a late wake-up or of a
-stretch cut in two."""
+"""Fraction of a cycle below which a measured stretch may be a remnant.
+
+Remnants come from a late wake-up, or from a stretch that was cut in two.
+"""
 REMNANT = 0.25
-"""Part of the median of a unit function: a remnant is shorter than that too, and left out."""
+"""Fraction of the median of its unit function below which such a stretch is left out."""
 GAP = 0.1
-"""Part of a cycle below which a measured gap is left out: waking up takes time, and is not
-idleness."""
+"""Fraction of a cycle below which a measured gap is left out.
+
+Waking up takes time and does not mean that the core is idle.
+"""
 
 
 @dataclass(frozen=True)
 class Lane:
     """A row of a Gantt chart: the tasks of one board on one core.
 
-    That is an executor, with its planner where they are tightly coupled, or a planner alone.
-    `cycle_ns` is the level's cycle, `slice_ns` the time for one plan; without a planner, one cycle.
-    `phase_ns` is the start of the first cycle.
+    It contains an executor, with its planner if they are tightly coupled, or only a planner.
+
+    Attributes:
+        core: Core of the tasks.
+        board: Name of the board.
+        executor: Name of the executor. None in the lane of a planner.
+        planner: Name of the planner. None if it has another lane, or if there is none.
+        priority: Highest priority of the tasks.
+        cycle_ns: Cycle of the level, ns.
+        slice_ns: Time for one plan, or one cycle without a planner, ns.
+        phase_ns: Start of the first cycle, ns.
     """
 
     core: int
@@ -50,21 +62,21 @@ class Lane:
 
     @property
     def tasks(self) -> tuple[str, ...]:
-        """Names of its tasks."""
+        """Names of the tasks."""
         return tuple(name for name in (self.executor, self.planner) if name is not None)
 
     @property
     def name(self) -> str:
-        """Name of the executor; of the planner where it is alone."""
+        """Name of the executor, or else of the planner."""
         return self.tasks[0]
 
     def cycle_from(self, time_ns: int) -> int:
-        """Return the start of its first cycle that begins at a time or later."""
+        """Return the start of the first cycle that begins at `time_ns` or later."""
         return time_ns + (self.phase_ns - time_ns) % self.cycle_ns
 
     @property
     def title(self) -> str:
-        """Core and name."""
+        """Core and name for the chart."""
         return f"core {self.core}  {self.name}"
 
     @property
@@ -74,29 +86,32 @@ class Lane:
 
 
 def lanes_of(tasks: Sequence[TimedTask]) -> tuple[Lane, ...]:
-    """Return the lanes of `tasks`, by core, then by falling priority."""
+    """Return the lanes of `tasks`, sorted by core and then by descending priority."""
     lanes = []
     for core, board in dict.fromkeys((task.core, task.board) for task in tasks):
-        own = [task for task in tasks if (task.core, task.board) == (core, board)]
-        planner = next((task for task in own if task.role == "planner"), None)
+        board_tasks = [task for task in tasks if (task.core, task.board) == (core, board)]
+        planner = next((task for task in board_tasks if task.role == "planner"), None)
         lanes.append(
             Lane(
                 core=core,
                 board=board,
-                executor=next((task.name for task in own if task.role != "planner"), None),
+                executor=next((task.name for task in board_tasks if task.role != "planner"), None),
                 planner=None if planner is None else planner.name,
-                priority=max(task.priority for task in own),
-                cycle_ns=own[0].every_ns,
-                slice_ns=(planner or own[0]).period_ns,
-                phase_ns=own[0].phase_ns,
+                priority=max(task.priority for task in board_tasks),
+                cycle_ns=board_tasks[0].every_ns,
+                slice_ns=(planner or board_tasks[0]).period_ns,
+                phase_ns=board_tasks[0].phase_ns,
             )
         )
     return tuple(sorted(lanes, key=lambda lane: (lane.core, -lane.priority, lane.cycle_ns)))
 
 
 class Patterns(NamedTuple):
-    """How often each pattern occurred in a lane: over the cycles of a plan, and in single cycles
-    without one.
+    """Number of occurrences of each pattern in a lane.
+
+    Attributes:
+        plans: Patterns over the cycles of a plan.
+        cycles: Patterns of single cycles without a plan.
     """
 
     plans: Counter[str]
@@ -104,7 +119,7 @@ class Patterns(NamedTuple):
 
     @classmethod
     def none(cls) -> Patterns:
-        """Return a count of nothing."""
+        """Return empty counts."""
         return cls(Counter(), Counter())
 
     def add(self, other: Patterns) -> None:
@@ -115,8 +130,11 @@ class Patterns(NamedTuple):
 
 @dataclass(frozen=True)
 class Detail:
-    """The longest stretches that patterns leave out, ns: of each unit function, and of an idle
-    core.
+    """Longest stretches that patterns leave out, ns.
+
+    Attributes:
+        short_ns: Stretches of each unit function.
+        gap_ns: Stretches in which the core is idle.
     """
 
     short_ns: Mapping[Unit, int] = field(default_factory=dict)
@@ -124,59 +142,68 @@ class Detail:
 
     @classmethod
     def measured(cls, lane: Lane, median_ns: Mapping[Unit, int]) -> Detail:
-        """Return the detail of the measured patterns of a lane, from the medians of its unit
-        functions.
-        """
+        """Return the detail for measured patterns, by the medians of the lane's functions, ns."""
         longest = round(SHORT * lane.cycle_ns)
         short = {unit: min(longest, round(REMNANT * median)) for unit, median in median_ns.items()}
         if lane.is_tight:
-            # Its plan is in its own memory: reading it is not communication, unless it takes long.
+            # The plan is in local memory. Reading it is not communication, unless it takes long.
             short[Unit.EXCHANGE] = longest
         return cls(short, round(GAP * lane.cycle_ns))
 
 
 def patterns(chart: Chart, lane: Lane, within: Stretch, detail: Detail) -> Patterns:
-    """Return the patterns of a lane that began within a stretch, with " | " between the cycles of a
-    plan.
+    """Count the patterns of a lane that began within a stretch.
 
-    `chart` must extend beyond the stretch by a slice.
+    The cycles of a plan are separated by " | ".
+
+    Args:
+        chart: Chart that extends beyond the stretch by a slice.
+        lane: Lane whose patterns are counted.
+        within: Start and end of the stretch, ns.
+        detail: Longest stretches that patterns leave out.
     """
     counted = Patterns.none()
     spans = [span for span in chart.spans if span.core == lane.core]
     starts = [span.start_ns for span in spans]
-    # The ends are sorted as well, unless ordinary scheduling has mixed the tasks of a core.
+    # Without the maximum the ends may be unsorted, because ordinary scheduling mixes tasks.
     ends = list(accumulate((span.end_ns for span in spans), max))
     for start, cycles, is_plan in _beginnings(chart, lane, within):
         end = start + cycles * lane.cycle_ns
-        # The only cycles of a planner on its own processor are its plans.
+        # A planner on a separate processor has no cycles other than its plans.
         length = lane.cycle_ns if lane.executor is not None else end - start
         orders = []
         for begin in range(start, end, length):
-            near = spans[bisect_right(ends, begin) : bisect_left(starts, begin + length)]
-            own = [span for span in near if span.end_ns > begin]
-            orders.append(_order(own, lane, (begin, begin + length), detail))
+            candidates = spans[bisect_right(ends, begin) : bisect_left(starts, begin + length)]
+            overlapping = [span for span in candidates if span.end_ns > begin]
+            orders.append(_order(overlapping, lane, (begin, begin + length), detail))
         counter = counted.plans if is_plan else counted.cycles
         counter[" | ".join(orders)] += 1
     return counted
 
 
 def _beginnings(chart: Chart, lane: Lane, within: Stretch) -> Iterator[tuple[int, int, bool]]:
-    """Yield start, number of cycles and True for every plan; start, 1 and False for every cycle
-    without one.
+    """Yield the plans, and the cycles without a plan, that begin within a stretch.
+
+    Each is a tuple of its start, ns, its number of cycles, and whether it is a plan.
     """
     slices = lane.slice_ns // lane.cycle_ns
     plans = {job.release_ns for job in chart.jobs if lane.planner and job.task == lane.planner}
-    planned = {plan + at * lane.cycle_ns for plan in plans for at in range(slices)}
-    for at in range(lane.cycle_from(within[0]), within[1], lane.cycle_ns):
-        if at in plans:
-            yield at, slices, True
-        elif at not in planned and lane.executor is not None:
-            yield at, 1, False
+    planned = {plan + start_ns * lane.cycle_ns for plan in plans for start_ns in range(slices)}
+    for start_ns in range(lane.cycle_from(within[0]), within[1], lane.cycle_ns):
+        if start_ns in plans:
+            yield start_ns, slices, True
+        elif start_ns not in planned and lane.executor is not None:
+            yield start_ns, 1, False
 
 
 def _order(spans: Sequence[Span], lane: Lane, within: Stretch, detail: Detail) -> str:
-    """Return the order of the unit functions within a stretch, as in "R X W P -"; `spans` are those
-    in it, in the order of time.
+    """Format the order of the unit functions within a stretch, as in "R X W P -".
+
+    Args:
+        spans: Spans in the stretch, in chronological order.
+        lane: Lane of the pattern.
+        within: Start and end of the stretch, ns.
+        detail: Longest stretches that are left out.
     """
     stretches: list[tuple[Unit | None, int]] = []
     busy_until = within[0]
@@ -190,7 +217,7 @@ def _order(spans: Sequence[Span], lane: Lane, within: Stretch, detail: Detail) -
         busy_until = max(busy_until, end)
     if within[1] - busy_until > detail.gap_ns:
         stretches.append((None, within[1] - busy_until))
-    # Pieces of a unit function that other boards have preempted count as one.
+    # Pieces of a unit function between which other boards ran count as one.
     wholes = [
         (unit, sum(ns for _, ns in pieces))
         for unit, pieces in groupby(stretches, key=itemgetter(0))

@@ -1,4 +1,4 @@
-"""A Gantt chart as a picture. Imports matplotlib: see `rack.tools.console.pictures`."""
+"""Picture of a Gantt chart. It imports matplotlib, see `rack.tools.console.pictures`."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ COLOURS = {
     Unit.PLAN: "#44BB99",
     Unit.UPDATE: "#FFAABB",
 }
-"""Light colours, distinct to the colour-blind too, for black letters on them (Paul Tol)."""
+"""Light colours for black letters, which colour-blind readers can distinguish (Paul Tol)."""
 NAMES = {
     Unit.EXCHANGE: "C  exchange with the planner",
     Unit.READ: "R  read",
@@ -50,21 +50,30 @@ WIDTH_IN = 10.0
 LANE_IN = 0.55
 LEGEND_COLUMNS = 7
 BAR = 0.66
+# Sizes of letters. A short span has a smaller letter, and a very short one has none.
 LETTER_PT = 9.0
 SMALLEST_PT = 5.0
-"""Sizes of letters: a short span has a smaller one, a shorter one none."""
 LETTER = 1 / 520
-"""Part of the window that a point of a letter's size takes: a W is as wide as high, and has room on
-both sides."""
+"""Fraction of the window that each point of a letter's size takes.
+
+A W is as wide as high, and has a margin on both sides.
+"""
 CYCLE = 0.024
-"""Part of the window from which on a cycle's start is marked."""
+"""Fraction of the window above which the start of a cycle is marked."""
 FRAME_CHARACTER = 1 / 120
-"""Part of the window that a character of a frame's label takes."""
+"""Fraction of the window that a character of a frame's label takes."""
 
 
 def save(panels: Sequence[Panel], title: str, stem: Path) -> list[Path]:
-    """Draw the panels, one above the other on one axis of time, into `stem`.png and .svg; return
-    their paths.
+    """Draw panels, one above the other on one axis of time.
+
+    Args:
+        panels: Panels to draw.
+        title: Title of the picture.
+        stem: Path of the pictures without .png and .svg.
+
+    Returns:
+        Paths of the pictures.
     """
     lanes = [len(panel.lanes) for panel in panels]
     height = LANE_IN * sum(lanes) + 0.45 * len(panels) + 1.2
@@ -95,7 +104,7 @@ def save(panels: Sequence[Panel], title: str, stem: Path) -> list[Path]:
 
 
 def draw(axes: Axes, panel: Panel) -> None:
-    """Draw one panel: the first lane on top. Along the axis are ns, labelled in ms."""
+    """Draw one panel with the first lane on top. The axis is in ns, with labels in ms."""
     chart = panel.chart
     count = len(panel.lanes)
     for row, lane in enumerate(panel.lanes):
@@ -105,37 +114,37 @@ def draw(axes: Axes, panel: Panel) -> None:
         axes.vlines(starts, -0.5, count - 0.5, colors=FRAME, linewidth=0.8, linestyles="dashed")
         character_ns = round(FRAME_CHARACTER * (chart.end_ns - chart.start_ns))
         for number, start in numbered_frames(panel, character_ns, "frame "):
-            place = (start, count - 0.5)
-            axes.annotate(f"frame {number}", place, fontsize=7, va="bottom", color=GRID)
+            position = (start, count - 0.5)
+            axes.annotate(f"frame {number}", position, fontsize=7, va="bottom", color=GRID)
     axes.set_xlim(chart.start_ns, chart.end_ns)
     axes.set_ylim(-0.5, count - 0.5)
-    # The axis is as wide as a chart in letters.
+    # Space the labels as in a chart in letters, which has the same width.
     times = label_times(panel, (chart.end_ns - chart.start_ns) // COLUMNS)
     axes.set_xticks(times, [ms(time) for time in times])
     axes.set_yticks(range(count), [lane.title for lane in reversed(panel.lanes)])
     axes.tick_params(left=False)
-    pad = 14 if panel.frames else None
-    axes.set_title(panel.kind, fontsize=9, loc="left", pad=pad)
+    title_pad = 14 if panel.frames else None
+    axes.set_title(panel.kind, fontsize=9, loc="left", pad=title_pad)
     for side in ("top", "right", "left"):
         axes.spines[side].set_visible(False)
 
 
-def _draw_lane(axes: Axes, panel: Panel, lane: Lane, at: int) -> None:
+def _draw_lane(axes: Axes, panel: Panel, lane: Lane, row: int) -> None:
     chart = panel.chart
-    low = at - BAR / 2
+    low = row - BAR / 2
     window_ns = chart.end_ns - chart.start_ns
     axes.broken_barh([(chart.start_ns, window_ns)], (low, BAR), facecolors=FLOOR)
-    own = [span for span in chart.spans if span.task in lane.tasks]
+    lane_spans = [span for span in chart.spans if span.task in lane.tasks]
     for unit in Unit:
-        bars = [(s.start_ns, s.end_ns - s.start_ns) for s in own if s.unit is unit]
+        bars = [(s.start_ns, s.end_ns - s.start_ns) for s in lane_spans if s.unit is unit]
         axes.broken_barh(bars, (low, BAR), color=COLOURS[unit], linewidth=EDGE)
-    letters = [(span.unit.value, (span.start_ns, span.end_ns)) for span in own]
+    letters = [(span.unit.value, (span.start_ns, span.end_ns)) for span in lane_spans]
     letters += [(IDLE, idle) for idle in panel.idle(lane)]
-    for letter, (begin, stop) in letters:
-        size = min((stop - begin) / window_ns / LETTER, LETTER_PT)
-        # Small dashes would be a dotted line.
+    for letter, (begin, end) in letters:
+        size = min((end - begin) / window_ns / LETTER, LETTER_PT)
+        # Small dashes would look like a dotted line.
         if size >= (LETTER_PT if letter == IDLE else SMALLEST_PT):
-            axes.text((begin + stop) / 2, at, letter, ha="center", va="center", fontsize=size)
+            axes.text((begin + end) / 2, row, letter, ha="center", va="center", fontsize=size)
     if lane.cycle_ns >= CYCLE * window_ns:
         starts = range(lane.cycle_from(chart.start_ns), chart.end_ns + 1, lane.cycle_ns)
         axes.vlines(list(starts), low - 0.1, low + BAR + 0.1, colors=GRID, linewidth=0.9)
@@ -143,10 +152,10 @@ def _draw_lane(axes: Axes, panel: Panel, lane: Lane, at: int) -> None:
         _mark_late(axes, chart, job, low + BAR + 0.06)
 
 
-def _mark_late(axes: Axes, chart: Chart, job: Job, at: float) -> None:
-    """Mark a missed deadline, and the time from it to the end of the job."""
-    due = max(job.deadline_ns, chart.start_ns)
-    if due == job.deadline_ns:
-        axes.plot([due], [at], marker="v", markersize=6, color=LATE, clip_on=False)
+def _mark_late(axes: Axes, chart: Chart, job: Job, height: float) -> None:
+    """Mark a missed deadline, and the time from the deadline to the end of the job."""
+    start_ns = max(job.deadline_ns, chart.start_ns)
+    if start_ns == job.deadline_ns:
+        axes.plot([start_ns], [height], marker="v", markersize=6, color=LATE, clip_on=False)
     if job.end_ns is not None:
-        axes.hlines(at, due, min(job.end_ns, chart.end_ns), colors=LATE, linewidth=1.6)
+        axes.hlines(height, start_ns, min(job.end_ns, chart.end_ns), colors=LATE, linewidth=1.6)

@@ -1,4 +1,4 @@
-"""The panel of a schedule, simulated from the budgets of a config."""
+"""The panel of a schedule, which is simulated from the budgets of a config."""
 
 from __future__ import annotations
 
@@ -17,31 +17,45 @@ from rack.tools.timing.charts.panel import Count, Panel
 from rack.tools.timing.charts.patterns import Detail, lanes_of, patterns
 
 SLICES = 10
-"""Fewest slices of the slowest task over which patterns are counted."""
+"""Minimum number of the slowest task's slices over which patterns are counted."""
 MOST_FRAMES = 24
-"""Most minor frames of a static schedule in a default chart."""
+"""Maximum number of minor frames of a static schedule in a default chart."""
 MOST_CYCLES = 1_000_000
-"""Most cycles of all tasks that are simulated: a minute of work."""
+"""Maximum number of simulated cycles of all tasks, which take about a minute."""
 
 
 E = TypeVar("E", Chart, Span, Job)
 
 
 class Schedule:
-    """The schedule of the tasks with a budget; there must be at least one.
+    """The schedule of the tasks with a budget. At least one task must have one.
 
-    `process_ns` are times of X by board, one a cycle, in turn; other boards take the budget's.
-    Raises `Failure` for a board in `process_ns` without a budget.
+    Attributes:
+        tasks: Tasks with their cores and priorities.
+        frame_ns: Minor frame of a static schedule, ns. 0 if there is none.
+        default_length_ns: Default length of a chart of a static schedule, ns. None without one.
+        switch_ns: Time of a context switch, ns.
     """
 
     def __init__(
         self, config: RackConfig, layout: Layout, process_ns: Mapping[str, Sequence[int]]
     ) -> None:
+        """Model the tasks of a config.
+
+        Args:
+            config: Config of the rack.
+            layout: Layout of its segment.
+            process_ns: Times of X by board, ns, which are repeated cycle by cycle. Other boards
+                take the time of the budget.
+
+        Raises:
+            Failure: If a board in `process_ns` has no budget.
+        """
         timing = rack_timing(config, layout)
         self.tasks = timing.tasks
         self.frame_ns = 0 if timing.schedule is None else timing.schedule.minor * timing.tick_ns
-        # The frames of a static schedule up to the last that differs from those before it.
-        alike = [found.frames[0] for found in core_frames(timing)]
+        # Show the frames of a static schedule up to the last one that differs from earlier ones.
+        alike = [each.frames[0] for each in core_frames(timing)]
         self.shown_ns = min(max(alike) + 1, MOST_FRAMES) * self.frame_ns if alike else None
         self.switch_ns = round(config.timing.context_switch_ms * 1e6)
         self._variants = {name: self._variant(name, times) for name, times in process_ns.items()}
@@ -55,34 +69,39 @@ class Schedule:
 
     @property
     def shortest_ns(self) -> int:
-        """The shortest part of any task."""
+        """Shortest part of any task, ns."""
         return min((part.time_ns for task in self.tasks for part in task.parts), default=1)
 
     def panel(self, start_ns: int, end_ns: int) -> Panel:
-        """Return the panel of a window."""
-        # The schedule repeats with the least common multiple of all slices; with phases, from the
-        # second time on.
+        """Simulate the schedule and return the panel of a window.
+
+        Raises:
+            Failure: If too many cycles would have to be simulated.
+        """
+        # The schedule repeats with the least common multiple of all slices, but if tasks have
+        # phases, the first repetition differs.
         cycles = [
             len(self._variants.get(task.name, (task.parts,))) * task.every_ns for task in self.tasks
         ]
-        period = lcm(*cycles, *(task.period_ns for task in self.tasks))
+        period_ns = lcm(*cycles, *(task.period_ns for task in self.tasks))
         has_phases = any(task.phase_ns for task in self.tasks)
-        skipped = max(0, start_ns // period - has_phases) * period
-        longest = max(task.period_ns for task in self.tasks)
-        counted_ns = SLICES * longest
-        until = max(end_ns - skipped, counted_ns + longest)
-        if (jobs := sum(until // task.period_ns for task in self.tasks)) > MOST_CYCLES:
-            why = (
-                f"{SLICES} slices of the slowest task, {longest * 1e-6:g} ms each, hold {jobs}"
-                " cycles of all"
+        skipped_ns = max(0, start_ns // period_ns - has_phases) * period_ns
+        longest_ns = max(task.period_ns for task in self.tasks)
+        counted_ns = SLICES * longest_ns
+        until_ns = max(end_ns - skipped_ns, counted_ns + longest_ns)
+        if (jobs := sum(until_ns // task.period_ns for task in self.tasks)) > MOST_CYCLES:
+            raise Failure(
+                f"no schedule: {SLICES} slices of the slowest task,"
+                f" {longest_ns * 1e-6:g} ms each, hold {jobs} cycles of all tasks;"
+                f" at most {MOST_CYCLES} are simulated",
+                2,
             )
-            raise Failure(f"no schedule: {why}; at most {MOST_CYCLES} are simulated", 2)
-        chart = simulate(self.tasks, until, self.switch_ns, self._variants)
+        chart = simulate(self.tasks, until_ns, self.switch_ns, self._variants)
         lanes = lanes_of(self.tasks)
         detail = Detail(gap_ns=2 * self.switch_ns)
         return Panel(
             kind="schedule",
-            chart=_later(chart.window(start_ns - skipped, end_ns - skipped), skipped),
+            chart=_later(chart.window(start_ns - skipped_ns, end_ns - skipped_ns), skipped_ns),
             lanes=lanes,
             patterns={lane.name: patterns(chart, lane, (0, counted_ns), detail) for lane in lanes},
             counts={task.name: Count.of(chart, task.name, 0, counted_ns) for task in self.tasks},
@@ -90,6 +109,7 @@ class Schedule:
         )
 
     def _variant(self, board: str, times_ns: Sequence[int]) -> list[tuple[Part, ...]]:
+        """Return the parts of an executor's cycle for each time of X, ns."""
         executors = {task.name: task for task in self.tasks if task.role == "executor"}
         if board not in executors:
             raise Failure(
@@ -98,19 +118,19 @@ class Schedule:
                 2,
             )
         parts = [part for part in executors[board].parts if part.unit is not Unit.PROCESS]
-        at = sum(part.unit is not Unit.WRITE for part in parts)
-        return [(*parts[:at], Part(Unit.PROCESS, time), *parts[at:]) for time in times_ns]
+        index = sum(part.unit is not Unit.WRITE for part in parts)
+        return [(*parts[:index], Part(Unit.PROCESS, time), *parts[index:]) for time in times_ns]
 
 
 def _later(chart: Chart, by_ns: int) -> Chart:
-    """Return a chart moved to a later time."""
+    """Return a chart with all times increased by `by_ns`."""
 
-    def moved(entry: E) -> E:
+    def shift(entry: E) -> E:
         """Return a chart, span or job with all its times later."""
         times = {name: time for name, time in vars(entry).items() if name.endswith("_ns")}
-        later = {name: time + by_ns for name, time in times.items() if time is not None}
-        return replace(entry, **later)
+        shifted = {name: time + by_ns for name, time in times.items() if time is not None}
+        return replace(entry, **shifted)
 
     return replace(
-        moved(chart), spans=tuple(map(moved, chart.spans)), jobs=tuple(map(moved, chart.jobs))
+        shift(chart), spans=tuple(map(shift, chart.spans)), jobs=tuple(map(shift, chart.jobs))
     )

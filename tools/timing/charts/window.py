@@ -1,4 +1,4 @@
-"""The window of time that a chart shows, from the options of the command."""
+"""The window of time that a chart shows, by the options of the command."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from rack.tools.console.tables import ms
 from rack.tools.timing.charts.panel import NS_PER_MS
 
 SLICES = 2
-"""Plans in a default chart."""
+"""Number of plans in a default chart."""
 MOST_CYCLES = 48
-"""Most cycles of the fastest task in a default chart."""
+"""Maximum number of the fastest task's cycles in a default chart."""
 LONGEST = 2000
-"""Most cycles of a level in any chart."""
+"""Maximum number of a level's cycles in any chart."""
 
 
 @dataclass(frozen=True)
 class WindowOptions:
-    """The window that the user asks for, ns; None: not given."""
+    """Window for which the user asks, ns. None for an end that is not given."""
 
     from_ns: int | None = None
     to_ns: int | None = None
@@ -28,23 +28,23 @@ class WindowOptions:
     def window(
         self, task: TimedTask, extent_ns: int | None, start_ns: int, length_ns: int | None = None
     ) -> tuple[int, int]:
-        """Return start and end of the window, ns.
+        """Return the start and end of the window, ns.
 
         Args:
-            task: Task whose cycles count; the default window shows two of its plans.
-            extent_ns: Length of the run; None: an endless schedule.
-            start_ns: Default start.
-            length_ns: Another default length.
+            task: Task whose cycles count. The default window shows two of its plans.
+            extent_ns: Length of the run, ns. None for a schedule, which has no end.
+            start_ns: Default start, ns.
+            length_ns: Default length, ns. None for two plans of the task.
 
         Raises:
-            Failure: The window is empty, too long, or outside the run.
+            Failure: If the window is empty, too long, or outside the run.
         """
         start = start_ns if self.from_ns is None else self.from_ns
         end = start + (length_ns or SLICES * task.period_ns) if self.to_ns is None else self.to_ns
         if extent_ns is not None:
             if start >= extent_ns or (end > extent_ns and self.to_ns is not None):
                 raise Failure(
-                    f"{_window(start, end)}: outside the run, which lasts from 0 to"
+                    f"{_window(start, end)}: is outside the run, which lasts from 0 to"
                     f" {ms(extent_ns)} ms",
                     2,
                 )
@@ -52,42 +52,53 @@ class WindowOptions:
         if start >= end:
             raise Failure(f"{_window(start, end)}: --to-ms must be later than --from-ms", 2)
         if end - start > (longest_ns := LONGEST * task.every_ns):
-            most = f"a chart shows at most {LONGEST} cycles of '{task.board}', {ms(longest_ns)} ms"
-            raise Failure(f"{_window(start, end)}: {most}", 2)
+            raise Failure(
+                f"{_window(start, end)}: a chart shows at most {LONGEST} cycles of"
+                f" '{task.board}', {ms(longest_ns)} ms",
+                2,
+            )
         return start, end
 
 
 def shown_task(tasks: Sequence[TimedTask]) -> TimedTask:
-    """Return the task whose cycles count: the slowest that fits into a chart, if possible a tightly
-    coupled planner.
+    """Return the task whose cycles determine the default window.
+
+    It is the slowest task that fits into a chart, if possible a tightly coupled planner.
     """
     tasks = [task for task in tasks if task.role != "clock"]
     fastest = min(task.every_ns for task in tasks)
     cores = {(task.board, task.core) for task in tasks if task.role == "executor"}
-    seen = [task for task in tasks if SLICES * task.period_ns <= MOST_CYCLES * fastest]
-    tight = [task for task in seen if task.role == "planner" and (task.board, task.core) in cores]
+    shown = [task for task in tasks if SLICES * task.period_ns <= MOST_CYCLES * fastest]
+    tight = [task for task in shown if task.role == "planner" and (task.board, task.core) in cores]
     return max(
-        tight or seen or [min(tasks, key=lambda task: task.period_ns)],
+        tight or shown or [min(tasks, key=lambda task: task.period_ns)],
         key=lambda task: task.period_ns,
     )
 
 
 def times_of(process: Sequence[str]) -> dict[str, list[int]]:
-    """Return times of X by level, ns, from texts such as "level=3,2", in ms. Raises `Failure`."""
-    found = {}
+    """Parse times of X from texts such as "level=3,2", in ms.
+
+    Returns:
+        Times by level, ns.
+
+    Raises:
+        Failure: If a text has another form, or a negative time.
+    """
+    process_ns = {}
     for text in process:
         level, _, times = text.partition("=")
         try:
-            found[level] = [round(float(time) * NS_PER_MS) for time in times.split(",")]
+            process_ns[level] = [round(float(time) * NS_PER_MS) for time in times.split(",")]
         except (ValueError, OverflowError):
-            found[level] = [-1]
-        if min(found[level]) < 0:
+            process_ns[level] = [-1]
+        if min(process_ns[level]) < 0:
             raise Failure(
                 f"--process {text}: give a level and its times of X, ms, cycle by cycle, as in"
                 " level=3,2",
                 2,
             )
-    return found
+    return process_ns
 
 
 def _window(start_ns: int, end_ns: int) -> str:

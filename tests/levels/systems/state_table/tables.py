@@ -85,17 +85,17 @@ DOORS = vocabulary(
 LEXICON = {"colour": ("red", "green")}
 
 
-def found(folder: Path, text: str) -> list[str]:
+def find_mistakes(folder: Path, text: str) -> list[str]:
     """Return the mistakes in the text of a table."""
-    return flaws(read_table(written(folder, text), DOORS), DOORS, LEXICON)
+    return flaws(read_table(write_table(folder, text), DOORS), DOORS, LEXICON)
 
 
 def table(folder: Path, text: str = DOOR) -> StateTable:
     """Return the table in a text, unchecked."""
-    return read_table(written(folder, text), DOORS)
+    return read_table(write_table(folder, text), DOORS)
 
 
-def written(folder: Path, text: str) -> Path:
+def write_table(folder: Path, text: str) -> Path:
     path = folder / "door.toml"
     path.write_text(text)
     return path

@@ -1,5 +1,7 @@
-"""Every mistake in a state table is found, with its row; a table without one never runs out of
-rows."""
+"""The check of a state table finds every mistake and names its row.
+
+A table that passes has a row for every case.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,7 @@ from hypothesis import strategies as st
 
 from rack.levels.systems.state_table.checks import flaws
 from rack.levels.systems.state_table.table import RowConfig, StateTable, TableError, read_table
-from tests.levels.systems.state_table.tables import DOOR, DOORS, LEXICON, found, written
+from tests.levels.systems.state_table.tables import DOOR, DOORS, LEXICON, find_mistakes, write_table
 
 MOVES = 'when = { place = "between", late = "no" }'
 ARRIVED = 'when = { place = ["open", "shut"] }'
@@ -59,8 +61,8 @@ MISTAKES = {
     "missing do": (
         DRIVE + "\n",
         "",
-        "row 1 'open it': do: missing; actions with their parameters, in order; may be an empty"
-        " list",
+        "row 1 'open it': do: missing; actions with their parameters, in order; the list may be"
+        " empty",
     ),
     "missing status": (
         f'{DRIVE}\nstatus = "executing"\n',
@@ -127,18 +129,18 @@ MISTAKES = {
 def test_every_mistake_is_found_with_its_row(tmp_path: Path, mistake: str) -> None:
     before, after, expected = MISTAKES[mistake]
     assert before in DOOR
-    assert found(tmp_path, DOOR) == []
+    assert find_mistakes(tmp_path, DOOR) == []
     assert any(
-        line.startswith(expected) for line in found(tmp_path, DOOR.replace(before, after))
+        line.startswith(expected) for line in find_mistakes(tmp_path, DOOR.replace(before, after))
     ), expected
 
 
 @pytest.mark.parametrize(
     "text", ["start = ", "start = 3", 'start = "shut"', "\x00", 'start = "shut"\nrow = 5']
 )
-def test_a_file_that_is_no_table_is_one_error(tmp_path: Path, text: str) -> None:
+def test_a_file_that_is_not_a_table_is_a_single_error(tmp_path: Path, text: str) -> None:
     with pytest.raises(TableError):
-        read_table(written(tmp_path, text), DOORS)
+        read_table(write_table(tmp_path, text), DOORS)
     with pytest.raises(TableError, match="cannot be read: No such file"):
         read_table(tmp_path / "none.toml", DOORS)
 
@@ -155,11 +157,11 @@ CONDITIONS = st.dictionaries(
 
 
 def row_config(number: int, when: dict[str, set[str]], otherwise: bool) -> RowConfig:
-    """Return a row of the state "on" that is sound but for its cases."""
+    """Return a row of the state "on" whose only possible mistakes are its cases."""
     known = {name: sorted(values & set(DOORS.conditions[name])) for name, values in when.items()}
-    kept = {name: values for name, values in known.items() if values}
+    conditions = {name: values for name, values in known.items() if values}
     return RowConfig(
-        **{"name": f"row {number}", "state": "on", "when": kept, "else": otherwise},
+        **{"name": f"row {number}", "state": "on", "when": conditions, "else": otherwise},
         next="on",
         do=[],
         status="idle",

@@ -1,4 +1,4 @@
-"""The elemental move level as a state table, after a restart of its board: where it goes on."""
+"""The elemental move level as a state table: restarts, conditions and unreachable poses."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ LAST = {"words": "pick block1", "in_state": "reaching", "sent": 7, "reached": 1,
 
 @dataclass
 class Bench:
-    """The rack's memory, without any process, and the level on its board, as it starts."""
+    """Segment of the rack without any process, and the plan from which its level starts."""
 
     segment: Segment
     plan: Resolved
@@ -42,9 +42,8 @@ class Bench:
         writer.write(0)
         writer.close()
 
-    def restarted(self) -> tuple[MoveTable, Message]:
-        """Return the level after it has recalled its last messages, and the command that it would
-        send down."""
+    def restart(self) -> tuple[MoveTable, Message]:
+        """Return the level with its restored state, and the command that it would send down."""
         wiring = next(wiring for wiring in self.plan.tasks if wiring.task == LEVEL)
         level = find_class(wiring.target, Executor)(wiring.context)
         task = VirtualControlLoop(self.segment, wiring, level)
@@ -64,7 +63,7 @@ def bench(rack_name: str) -> Iterator[Bench]:
     segment.close()
 
 
-def test_it_goes_on_with_the_command_that_it_sent_down_last(bench: Bench) -> None:
+def test_a_restarted_level_continues_with_its_last_command_to_the_level_below(bench: Bench) -> None:
     joints = np.linspace(0.1, 0.6, 6)
     bench.write("status", **LAST)
     bench.write(
@@ -76,7 +75,7 @@ def test_it_goes_on_with_the_command_that_it_sent_down_last(bench: Bench) -> Non
         aim=(1.0, 2.0, 3.0),
         yaw=0.25,
     )
-    level, command = bench.restarted()
+    level, command = bench.restart()
     assert (level.state, level.words) == ("reaching", ["pick", "block1"])
     assert level._reached
     assert (command.id, command.words, command.object) == (7, "pose above", 1)
@@ -85,24 +84,23 @@ def test_it_goes_on_with_the_command_that_it_sent_down_last(bench: Bench) -> Non
     np.testing.assert_array_equal(command.aim, (1.0, 2.0, 3.0))
 
 
-def test_without_a_command_of_its_own_it_starts_where_the_arm_is(bench: Bench) -> None:
+def test_a_restarted_level_without_a_last_command_starts_at_home(bench: Bench) -> None:
     bench.write("status", **LAST)
-    level, command = bench.restarted()
+    level, command = bench.restart()
     home = level._cell.home
-    # It knows its own state, and nothing of a command: no joints are taken from a mailbox that is
-    # still empty.
+    # It knows its state but no command. No joints are taken from a mailbox that is still empty.
     assert (level.state, level._reached) == ("reaching", True)
     assert (command.id, command.words, command.speed, command.object) == (0, "", 1.0, -1)
     np.testing.assert_array_equal(command.joints, home)
 
 
-def test_a_board_that_starts_for_the_first_time_recalls_nothing(bench: Bench) -> None:
-    level, command = bench.restarted()
+def test_a_board_that_starts_for_the_first_time_restores_nothing(bench: Bench) -> None:
+    level, command = bench.restart()
     assert (level.state, level.words, command.id, command.words) == ("idle", [], 0, "")
 
 
 class Arm:
-    """The level, with what it reads of the arm and of the world as the test has it."""
+    """The level, whose inputs from the arm and the world are set by the test."""
 
     def __init__(self, bench: Bench) -> None:
         wiring = next(wiring for wiring in bench.plan.tasks if wiring.task == LEVEL)
@@ -130,7 +128,7 @@ def arm(bench: Bench) -> Arm:
     return Arm(bench)
 
 
-def test_it_sees_the_world_once_it_is_sensed(arm: Arm) -> None:
+def test_the_world_is_seen_once_it_has_been_sensed(arm: Arm) -> None:
     assert arm.look()["world"] == "seen"
     assert arm.look(lost=True)["world"] == "unseen"
     arm.world.revision = 0
@@ -155,14 +153,16 @@ def test_a_target_is_there_while_it_rests_where_it_was(arm: Arm) -> None:
 
 
 @pytest.mark.parametrize("words", ["", "home"])
-def test_a_pose_over_nothing_is_not_reached_and_ends_no_board(arm: Arm, words: str) -> None:
+def test_a_pose_without_an_object_is_not_reached_and_does_not_end_the_board(
+    arm: Arm, words: str
+) -> None:
     arm.level._taken = WordCommand(False, 3, words)
     sent = arm.level._command.id
     pose = next(iter(arm.level.table.plan.pose))
     arm.level.do_move(pose)
     assert not arm.level._reached
     assert arm.level._command.id == sent
-    # Nor is one out of reach.
+    # A pose out of reach is not reached either.
     arm.world.position[0] = (9.0, 0.0, 0.0)
     arm.look()
     arm.level._taken = WordCommand(False, 1, f"pick {arm.level.context.scene.objects[0]}")

@@ -1,5 +1,7 @@
-"""A level that is a state table, cycle by cycle: which row fires, what the status says of it, and
-what a restarted board remembers."""
+"""A level that follows a state table, cycle by cycle.
+
+Tests check the row that fires, the status, and the state of a restarted board.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,7 @@ PATIENCE_TICKS = 5
 
 
 class Door(StateTableExecutor):
-    """The door of `tables`: its lock and its place are as the test sets them."""
+    """The door of `tables`. The test sets its lock and its place."""
 
     vocabulary = DOORS
 
@@ -79,7 +81,7 @@ class Bench:
         self.tick = 100
 
     def command(self, serial: int, words: str, hold: bool = False, operator: int = 0) -> None:
-        """Let the level above command this from now on."""
+        """Set the command of the level above from now on."""
         message = TableCommand.zeros({})
         message.id = serial
         message.words = words
@@ -88,7 +90,7 @@ class Bench:
         self.above = Reading(message, Verdict.NEW)
 
     def order(self, serial: int, what: Operation, name: str = "") -> Message:
-        """Let the operator command this; return the status after the cycle that reads it."""
+        """Give an operator command, and return the status after the cycle that reads it."""
         message = OperatorCommand.zeros({})
         message.id = serial
         message.what = what
@@ -99,7 +101,7 @@ class Bench:
         return status
 
     def cycle(self) -> Message:
-        """Do one cycle; return the status."""
+        """Run one cycle and return the status."""
         vars(self.door).update(
             above={} if self.above is None else {"task": self.above},
             last_status=self.last,
@@ -111,7 +113,7 @@ class Bench:
         return self.status
 
     def restart(self) -> None:
-        """Start the board again: it finds the last status, and every command of the operator."""
+        """Restart the board with its last status and every command of the operator."""
         last = TableStatus.zeros({})
         last.copy_from(self.status)
         self.last = Reading(last, Verdict.NEW)
@@ -145,7 +147,7 @@ def test_a_command_from_above_is_taken_done_and_answered(bench: Bench) -> None:
     assert brief(status) == ("shut", 5, "arrived", "open", State.DONE)
     assert (status.echo, status.done) == (4, 4)
     assert bench.door.drives == ["slowly", "stop"]
-    # It is done: the same serial is no new command, the next one is.
+    # The command is done. The same serial is not a new command, but the next one is.
     assert bench.cycle().fired == "stay shut"
     bench.command(5, "open")
     status = bench.cycle()
@@ -158,7 +160,7 @@ def test_a_command_that_no_row_takes_is_not_in_force(bench: Bench) -> None:
     status = bench.cycle()
     assert brief(status) == ("shut", 2, "locked", "", State.HOLDING)
     assert (status.reason, status.echo) == ("locked", 0)
-    # A reason from below is added to that of a row.
+    # A reason from below is appended to a row's reason.
     bench.door.detail = "no key"
     assert bench.cycle().reason == "locked: no key"
     bench.door.lock = "free"
@@ -213,7 +215,7 @@ def test_an_operators_hold_is_done_when_all_is_at_rest(bench: Bench) -> None:
     assert status.reason.startswith("no row of 'moving' takes lock = free, place = nowhere")
 
 
-def test_an_operators_command_goes_before_that_of_the_level_above(bench: Bench) -> None:
+def test_an_operators_command_takes_precedence_over_the_level_above(bench: Bench) -> None:
     bench.command(7, "paint red")
     status = bench.order(3, Operation.DO, "open")
     assert brief(status) == ("moving", 1, "open it", "open", State.EXECUTING)
@@ -221,13 +223,13 @@ def test_an_operators_command_goes_before_that_of_the_level_above(bench: Bench) 
     bench.door.place = "open"
     status = bench.cycle()
     assert (status.state, status.answer, status.done) == (State.DONE, Answer.DONE, 0)
-    # Released, the level goes on with the command from above.
+    # After its release the level continues with the command from above.
     bench.order(4, Operation.RESUME)
     assert bench.cycle().echo == 0
     assert not bench.door.holds
 
 
-def test_an_operator_hears_which_words_and_tables_there_are(bench: Bench) -> None:
+def test_a_refusal_names_the_invalid_word_and_the_valid_tables(bench: Bench) -> None:
     status = bench.order(1, Operation.DO, "paint blue")
     assert (status.answer, status.standing, status.words) == (Answer.REFUSED, Operation.NONE, "")
     assert "blue" in status.objection
@@ -237,7 +239,7 @@ def test_an_operator_hears_which_words_and_tables_there_are(bench: Bench) -> Non
     assert status.table == "normal"
 
 
-def test_a_restarted_board_goes_on_where_its_last_status_was(bench: Bench) -> None:
+def test_a_restarted_board_continues_from_its_last_status(bench: Bench) -> None:
     bench.order(1, Operation.TABLE, "careful")
     bench.order(2, Operation.TABLE, "normal")
     bench.command(6, "open")
@@ -251,7 +253,7 @@ def test_a_restarted_board_goes_on_where_its_last_status_was(bench: Bench) -> No
     assert bench.cycle().done == 6
     bench.restart()
     assert (bench.cycle().fired, bench.status.done) == ("stay shut", 6)
-    # So it does with an operator's command.
+    # It also continues with an operator's command.
     bench.door.place = "shut"
     bench.order(3, Operation.DO, "open")
     bench.restart()

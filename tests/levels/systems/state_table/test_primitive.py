@@ -1,5 +1,4 @@
-"""The primitive level as a state table: what it senses, begins, halts and grips, and its set
-points, without a rack."""
+"""The primitive level as a state table, without a rack: conditions, motions and set points."""
 
 from __future__ import annotations
 
@@ -33,7 +32,7 @@ def context() -> LevelContext:
 
 
 class Bench:
-    """The level with messages that the test fills; its arm is where it is commanded, at first."""
+    """The level with messages that the test fills. The arm is initially where it is commanded."""
 
     def __init__(self, context: LevelContext) -> None:
         self.context = context
@@ -52,7 +51,7 @@ class Bench:
         return kind.zeros(self.context.sizes)
 
     def command(self, joints: np.ndarray, speed: float = 1.0, row: int = -1) -> None:
-        """Let the level above command this from now on."""
+        """Set the command of the level above from now on."""
         command = self.message(JointMove)
         command.joints = joints
         command.speed = speed
@@ -68,7 +67,7 @@ class Bench:
         return self.level.look(self.tick)
 
     def give(self) -> Message:
-        """Write, and let the arm be there; return the set point."""
+        """Write the set point, move the arm there, and return the set point."""
         self.level.give(self.tick)
         command = self.level.command
         for below in self.below:
@@ -78,7 +77,7 @@ class Bench:
         return command
 
     def follow(self) -> None:
-        """Do a cycle in which the boards below follow."""
+        """Run a cycle in which the boards below follow."""
         self.look()
         self.give()
 
@@ -90,7 +89,7 @@ def bench(context: LevelContext) -> Bench:
 
 def test_a_motion_leads_straight_from_rest_to_rest(bench: Bench) -> None:
     bench.follow()
-    # One to where the arm is never begins.
+    # A motion to the present position never begins.
     bench.command(bench.home)
     bench.look()
     bench.level.do_begin()
@@ -159,7 +158,7 @@ def test_a_motion_that_is_halted_comes_to_rest_elsewhere(bench: Bench, action: s
     last = bench.give().position
     assert (last > before).all()
     assert (last < bench.home + 0.4).all()
-    # At rest there is nothing to halt.
+    # A halt at rest has no effect.
     bench.level.do_halt()
     assert bench.level._curve is None
 
@@ -172,7 +171,7 @@ def test_the_arm_is_away_while_a_board_below_is_stopped_or_lost(bench: Bench) ->
     assert bench.level.detail == "brakes"
     bench.below[1].stopped = 0
     bench.below[1].reason = ""
-    # It goes on from where the arm is.
+    # It continues from where the arm is.
     bench.below[0].position = bench.home + 0.2
     assert bench.look()["arm"] == "resting"
     np.testing.assert_allclose(bench.give().position, bench.home + 0.2)
@@ -198,7 +197,7 @@ def test_the_arm_is_away_while_a_board_below_is_stopped_or_lost(bench: Bench) ->
         (False, 0.0, 0.0021, "moving"),
     ],
 )
-def test_a_gripper_holds_what_keeps_it_from_closing(
+def test_a_gripper_that_cannot_close_completely_holds_something(
     bench: Bench, is_closed: bool, off: float, speed: float, expected: str
 ) -> None:
     gripper = bench.level._gripper
@@ -208,7 +207,7 @@ def test_a_gripper_holds_what_keeps_it_from_closing(
     assert bench.look()["gripper"] == expected
 
 
-def test_a_restarted_board_recalls_its_gripper_and_its_set_point(bench: Bench) -> None:
+def test_a_restarted_board_restores_its_gripper_and_its_set_point(bench: Bench) -> None:
     last = bench.message(JointMoveStatus)
     last.closed = 1
     last.held = 1

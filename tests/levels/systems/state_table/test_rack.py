@@ -1,5 +1,4 @@
-"""The rack of state tables, from its config: it picks a block up, and goes on where its boards have
-died."""
+"""The rack of state tables: it picks up a block, although boards die, and invalid tables fail."""
 
 from __future__ import annotations
 
@@ -19,20 +18,19 @@ FOLDER = CONFIGS / "nist-state-table"
 KILLED = 'fault=[{ kind = "kill", board = "primitive", at = 0.3 }]'
 
 
-def fired(rack: Rack, level: str) -> list[str]:
-    """Return the names of the rows that fired in a level, in order, each once until another
-    fires."""
+def list_fired_rows(rack: Rack, level: str) -> list[str]:
+    """Return the names of the rows that fired in a level, in order, without repetitions."""
     names = MailboxRing(rack.segment, f"{level}.status").drain().rows["message"]["fired"]
     return [name.decode() for at, name in enumerate(names) if not at or name != names[at - 1]]
 
 
 @pytest.mark.slow
-def test_it_picks_up_a_block_though_a_board_dies_on_the_way(rack_name: str) -> None:
+def test_the_rack_picks_up_a_block_although_a_board_dies(rack_name: str) -> None:
     config = load("nist-state-table", [f"name={rack_name}", "clock.mode=lockstep", KILLED])
     with Rack(config) as rack:
         outcome = rack.run(4.3)
         model = MailboxRing(rack.segment, "world.model").drain().rows["message"]["position"]
-        moves, motions = fired(rack, "elemental_move"), fired(rack, "primitive")
+        moves, motions = list_fired_rows(rack, "elemental_move"), list_fired_rows(rack, "primitive")
     assert not outcome.faults
     assert "at rest on the way: go on" in motions
     assert "got it: raise it" in moves

@@ -1,4 +1,4 @@
-"""The rack of state tables does its task as it did, with all that its levels say on the way."""
+"""The rack of state tables repeats its task with all messages, as in the snapshots."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SNAPSHOTS = Snapshots(__file__)
 @pytest.fixture(scope="module", autouse=True)
 def _rounded_alike() -> None:
     if golden.machine()["libm"] != golden.read()["machine"]["libm"]:
-        pytest.skip("the C library here rounds otherwise than that of the snapshots")
+        pytest.skip("this C library rounds differently from the one of the snapshots")
 
 
 @pytest.mark.parametrize(
@@ -27,7 +27,9 @@ def _rounded_alike() -> None:
         ("nist-state-table/three-poses", None, 8.0),
     ],
 )
-def test_it_does_what_it_did(name: str, faults: str | None, seconds: float, rack_name: str) -> None:
+def test_the_whole_task_repeats_its_snapshot(
+    name: str, faults: str | None, seconds: float, rack_name: str
+) -> None:
     config = load(name, [f"name={rack_name}", "clock.mode=lockstep"], faults)
     parts = whole_run(config, seconds)
     case = name if faults is None else f"{name}, {faults}"

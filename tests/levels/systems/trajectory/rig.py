@@ -1,4 +1,4 @@
-"""A trajectory level alone: requests from lists, and boards that obey its set points."""
+"""A trajectory level with queued requests and boards that follow its set points."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ PERIOD_S = EVERY * CLOCK_NS * 1e-9
 
 
 class TrajectoryRig:
-    """Runs the level cycle by cycle. Boards follow its set points exactly, and hold without."""
+    """Runs the level cycle by cycle. Boards follow its set points exactly, or else hold."""
 
     level_class: type[TrajectoryExecutor] = TrajectoryExecutor
     request_type = MotionRequest
@@ -69,7 +69,7 @@ class TrajectoryRig:
         self.ids = 0
         self.order = self.message(OperatorCommand)
         self.ordered = False
-        self.positions: list[Array] = []  # those of set points, by cycle
+        self.positions: list[Array] = []  # of the set points, by cycle
         self.velocities: list[Array] = []
 
     def _connect(self) -> None:
@@ -82,7 +82,7 @@ class TrajectoryRig:
         return kind(self._kinds[kind])
 
     def request(self, kind: MotionKind, **fields: Any) -> int:
-        """Queue a request; return its id."""
+        """Queue a request and return its id."""
         self.ids += 1
         request = self.message(self.request_type)
         request.id, request.kind, request.body, request.quaternion = (
@@ -97,15 +97,17 @@ class TrajectoryRig:
         return self.ids
 
     def joints(self, change: Sequence[float] | Array, **fields: Any) -> int:
-        """Queue a motion to home plus `change`, rad; return its id."""
+        """Queue a motion to home plus `change`, rad, and return its id."""
         return self.request(MotionKind.JOINTS, joints=self.cell.home + np.asarray(change), **fields)
 
     def say(self, what: Operation) -> None:
         self.order.id, self.order.what, self.ordered = self.order.id + 1, what, True
 
     def restart(self) -> None:
-        """Replace the level, as after the death of its board: its set points end, and the boards
-        hold."""
+        """Replace the level as after the death of its board.
+
+        Its set points end, and the boards hold.
+        """
         self.level = self.level_class(self.context)
         self._connect()
         self.brake()
@@ -166,7 +168,7 @@ class TrajectoryRig:
                 status.holding, status.target_velocity = 1, 0.0
 
     def cycle(self) -> Message:
-        """Run one cycle; return the status."""
+        """Run one cycle and return the status."""
         self.obey()
         self.read()
         self.level.process(self.tick)
@@ -177,7 +179,7 @@ class TrajectoryRig:
         return self.written["status"]
 
     def run(self, seconds: float) -> Message:
-        """Run for simulated `seconds`; return the status."""
+        """Run for simulated `seconds` and return the status."""
         for _ in range(round(seconds / PERIOD_S)):
             self.cycle()
         return self.written["status"]
@@ -192,8 +194,7 @@ class TrajectoryRig:
         }
 
     def excess(self) -> tuple[float, float]:
-        """Return the greatest velocity and acceleration of the positions so far, as parts of the
-        limits."""
+        """Return the largest velocity and acceleration so far as fractions of the limits."""
         speeds = np.diff(self.positions, axis=0) / PERIOD_S
         bends = np.diff(speeds, axis=0) / PERIOD_S
         limits = self.cell.limits

@@ -1,5 +1,4 @@
-"""Motion has no step in position or velocity, whatever requests come when, and keeps the limits of
-every joint."""
+"""Motion is continuous and keeps the limits of every joint for any sequence of requests."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""The command environment of the host side: calls become requests, in order, each until it is
-done."""
+"""The command environment of the host side: calls become requests in the order of the calls."""
 
 from __future__ import annotations
 
@@ -36,8 +35,10 @@ CONTEXT = LevelContext(
 
 
 class Level:
-    """A bus with a level at its other end, which does one request at each wait, a second; and both
-    ports of its program. `room` messages may wait."""
+    """A bus with a level that carries out one request per wait of a second.
+
+    It is also both ports of the program. At most `room` messages may wait.
+    """
 
     def __init__(self, room: int = 100, sent: int = 0) -> None:
         self.room, self.sent, self.is_over, self.tick = room, sent, False, 0
@@ -49,7 +50,7 @@ class Level:
         self.message = MotionRequest.zeros(SIZES)
 
     def wait(self, timeout_s: float) -> bool:
-        """Do the next request, or lose it."""
+        """Carry out the next request, or lose it."""
         self.time_s += 1.0
         if self.queue:
             request = self.queue.popleft()
@@ -104,13 +105,13 @@ def test_calls_become_requests_in_their_order_and_wait_ends_with_the_last() -> N
     assert not arm.wait(until=lambda: arm.done(first))
     assert not arm.done(last)
     with pytest.raises(
-        LevelError, match=r"line: body = block9: not in the scene; permitted: block1, "
+        LevelError, match=r"line: body = block9: not in the scene; its bodies are block1, "
     ):
         arm.line((0.0, 0.0, 0.1), body="block9")
 
 
 @pytest.mark.parametrize(("room", "loses"), [(2, ()), (100, (2,))], ids=["full", "lost"])
-def test_with_a_full_queue_or_a_lost_request_nothing_is_left_out(
+def test_no_request_is_left_out_after_a_full_queue_or_a_loss(
     room: int, loses: tuple[int, ...]
 ) -> None:
     level = Level(room=room)
@@ -122,7 +123,7 @@ def test_with_a_full_queue_or_a_lost_request_nothing_is_left_out(
     assert [request.id for request in level.done] == [*range(1, 11)]
 
 
-def test_a_process_that_is_restarted_cancels_first_and_numbers_beyond_all_before() -> None:
+def test_a_restarted_process_cancels_first_and_uses_new_numbers() -> None:
     level = Level(sent=7)
     arm = motions(level)
     arm.stay(0.1)

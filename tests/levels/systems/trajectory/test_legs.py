@@ -1,4 +1,4 @@
-"""Time laws and ramps to rest are smooth, and keep the limits of every joint."""
+"""Time laws and ramps to rest are smooth and keep the limits of every joint."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def test_a_leg_is_smooth_and_passes_its_goal_in_the_middle_of_its_blend() -> Non
     assert (speed >= 0.0).all()
     assert abs(speed.max() - 1.0) < 1e-9
     assert np.abs(np.diff(speed)).max() / H <= 0.75 / 0.2 + 1e-6
-    # At full speed it would be at its goal after the nominal time.
+    # At full speed the leg would reach its goal at the nominal time.
     at = law.ends_s / 2.0
     assert abs(law.part(at) + (law.nominal_s - at) / law.segment_s - 1.0) < 1e-12
 

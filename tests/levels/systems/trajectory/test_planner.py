@@ -1,5 +1,7 @@
-"""The planning level alone: requests of a program, a few ahead of the arm, none lost and none done
-twice."""
+"""The planning level alone.
+
+It queues the requests of a program a few steps ahead of the arm. None is lost or carried out twice.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,7 @@ MOVES = [{"do": "move", "joints": [0.1 * k, 1.4, -3.1, 0.0, -1.44, 0.0]} for k i
 
 
 class PlanningRig:
-    """Runs a planner; the test says how far the level below is."""
+    """Runs a planner. The test sets the progress of the level below."""
 
     def __init__(self, steps: Sequence[Mapping[str, Any]], places: int = 32, **params: Any) -> None:
         self.context = LevelContext(
@@ -56,14 +58,14 @@ class PlanningRig:
         self.planner.place_output("plan", Sender(self.request, self._send, lambda: 1))
 
     def _send(self) -> bool:
-        """Take a copy, if there is a place."""
+        """Queue a copy if there is a free place."""
         if len(self.sent) - self.below.taken >= self.places:
             return False
         self.sent.append(self.request.record.copy())
         return True
 
     def run(self, cycles: int = 1) -> list[int]:
-        """Plan in some cycles; return the ids sent in them."""
+        """Plan for some cycles, and return the ids that were sent."""
         before = len(self.sent)
         for _ in range(cycles):
             vars(self.planner).update(
@@ -87,12 +89,12 @@ def test_requests_are_queued_a_few_ahead_of_the_arm() -> None:
     )
 
 
-def test_a_restarted_planner_goes_on_after_the_newest_request_taken() -> None:
+def test_a_restarted_planner_continues_after_the_newest_request_taken() -> None:
     rig = PlanningRig(MOVES, ahead=3)
     rig.run(3)
     rig.below.taken, rig.below.done = 2, 2
     rig.start()
-    # Request 3 may still be in the queue: sent twice, it is done once.
+    # Request 3 may still be in the queue. It is sent twice and carried out once.
     assert rig.run(4) == [3, 4, 5]
 
 
@@ -138,7 +140,7 @@ def test_tool_goals_become_joint_positions_near_those_before() -> None:
     [
         (
             {"do": "move", "joints": [0.0]},
-            "task.step[0].joints = [0.0]: 1 values; permitted: 6, one per joint",
+            "task.step[0].joints = [0.0]: has 1 values; must have 6, one per joint",
         ),
         (
             {"do": "line", "position": [0, 0, 0], "body": "car"},

@@ -1,4 +1,4 @@
-"""The trajectory level as its neighbours see it."""
+"""The trajectory level as seen by its neighbours."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ POST = 3  # row of a body that moves
 
 
 class TrackingRig(TrajectoryRig):
-    """With a body that moves along y from a second on."""
+    """A rig with a body that moves along y after the first second."""
 
     def __init__(self, speed: float = 0.1) -> None:
         super().__init__()
@@ -48,7 +48,7 @@ def test_the_tool_keeps_up_with_a_body_that_moves() -> None:
     status = rig.written["status"]
     assert status.current == 2
     assert 0.0 < status.astray < 1e-3
-    # The set point is due two cycles later: the tool is where the body will be then.
+    # The set point is due two cycles later, therefore the tool leads the body.
     ahead_s = (rig.tick + EVERY) * 1e-3 - rig.at
     assert np.allclose(status.tool - rig.tool, [0, rig.speed * ahead_s, 0], atol=1e-3)
     rig.follow(4.0)
@@ -58,7 +58,7 @@ def test_the_tool_keeps_up_with_a_body_that_moves() -> None:
     assert rig.ends() == {1: RequestEnd.DONE, 2: RequestEnd.DONE, 3: RequestEnd.DONE}
 
 
-def test_an_error_refuses_what_comes_until_a_cancel() -> None:
+def test_after_an_error_new_requests_are_refused_until_a_cancel() -> None:
     rig = TrajectoryRig()
     tool = rig.cycle().tool.copy()
     rig.joints([0.3, 0, 0, 0, 0, 0])
@@ -102,7 +102,7 @@ def test_an_error_refuses_what_comes_until_a_cancel() -> None:
         ({"kind": 9}, "kind 9; permitted: 1 to 5"),
     ],
 )
-def test_a_request_that_nobody_could_do_is_refused_in_one_line(fields: dict, why: str) -> None:
+def test_an_impossible_request_is_refused_in_one_line(fields: dict, why: str) -> None:
     rig = TrajectoryRig()
     rig.request(**fields)
     status = rig.run(0.2)
@@ -131,7 +131,7 @@ def test_a_restarted_level_neither_repeats_nor_loses_a_request() -> None:
     assert np.allclose(rig.positions[-1] - rig.cell.home, [0.2, 0, 0, 0, 0, 0], atol=1e-9)
 
 
-def test_a_request_that_was_lost_is_missed_until_it_is_sent_again() -> None:
+def test_a_lost_request_is_missing_until_it_is_sent_again() -> None:
     rig = TrajectoryRig()
     for part in (0.1, 0.2, 0.3):
         rig.joints([part, 0, 0, 0, 0, 0])
@@ -140,7 +140,7 @@ def test_a_request_that_was_lost_is_missed_until_it_is_sent_again() -> None:
     status = rig.run(3.0)
     assert (status.taken, status.done, status.state) == (1, 1, State.HOLDING)
     assert status.reason == "request 2 is missing: send all again from there, or a cancel"
-    # Those that were sent twice are done once.
+    # Requests that were sent twice are carried out once.
     rig.queue += [lost, lost, later]
     status = rig.run(4.0)
     assert (status.taken, status.done, status.state) == (3, 3, State.DONE)
@@ -163,7 +163,7 @@ def test_the_level_waits_for_every_board_and_continues_from_where_the_arm_is() -
     assert rig.written["command"].due == 0
     assert status.state == State.HOLDING
     assert status.reason == f"waiting for {name}: brakes engaged"
-    stopped.target[0] += 0.02  # it sagged meanwhile
+    stopped.target[0] += 0.02  # the arm sags
     stopped.stopped, stopped.reason = 0, ""
 
     rig.cycle()

@@ -15,8 +15,10 @@ threads = {str(number): thread for number in range(int(options["threads"]))}
 with open(options["json"], "w") as file:
     json.dump({"thread": threads}, file)
 """
-"""Late by 12 us, but for one wake at 2.5 ms and two beyond its histogram, of which the longest is
-known."""
+"""Program whose wakes are late by 12 us, except one at 2.5 ms and two beyond its histogram.
+
+Only the longest of the latter is known.
+"""
 REFUSED = """\
 import sys
 sys.exit("Unable to change scheduling policy!")
@@ -24,7 +26,7 @@ sys.exit("Unable to change scheduling policy!")
 
 
 def program(folder: Path, name: str, text: str) -> Path:
-    """Write a program in Python, to be found on a path; return its folder."""
+    """Write a Python program that can be found on a path, and return its folder."""
     path = folder / name
     path.write_text(f"#!{sys.executable}\n{text}")
     path.chmod(0o755)

@@ -1,4 +1,4 @@
-"""The command line of another checkout: it runs in that checkout's own environment."""
+"""The command line of another checkout runs in the environment of that checkout."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ esac
 """
 
 
-def tree_of(folder: Path, of: Path) -> Path:
-    """Make a checkout whose environment says that it is of another one."""
+def create_tree(folder: Path, of: Path) -> Path:
+    """Create a checkout whose environment claims to belong to the tree `of`."""
     (folder / "tools").mkdir(parents=True)
     (folder / "tools" / "cli.py").touch()
     (folder / ".venv" / "bin").mkdir(parents=True)
@@ -36,7 +36,7 @@ def test_a_checkout_runs_in_its_own_environment(
 ) -> None:
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     monkeypatch.setenv("VIRTUAL_ENV", str(tmp_path))
-    this, other = rack_commands(tree_of(tmp_path / "other", tmp_path / "other"))
+    this, other = rack_commands(create_tree(tmp_path / "other", tmp_path / "other"))
     assert (this.name, other.name) == ("this tree", "other")
     assert other.run("run", 3, bound_s=BOUND_S) == "own run 3\n"
     assert "Usage: rack" in this.run("--help", bound_s=BOUND_S)
@@ -52,13 +52,13 @@ def test_a_command_that_hangs_is_ended() -> None:
         command.run("wait", bound_s=0.5)
 
 
-def test_a_tree_without_an_environment_of_its_own_is_refused_in_one_line(tmp_path: Path) -> None:
-    bare = tree_of(tmp_path / "bare", tmp_path)
+def test_a_tree_without_a_separate_environment_is_refused_in_one_line(tmp_path: Path) -> None:
+    bare = create_tree(tmp_path / "bare", tmp_path)
     (bare / ".venv" / "bin" / "python").unlink()
     mistakes = {
-        tmp_path / "nowhere": "not a checkout of rack: it has no tools/cli.py",
-        bare: f"no environment .venv; to make it: make -C {bare} .venv/installed",
-        tree_of(tmp_path / "copied", ROOT): f"its .venv is that of {ROOT}; to make its own: make",
+        tmp_path / "nowhere": "is not a checkout of rack: it has no tools/cli.py",
+        bare: f"has no environment .venv; to create it: make -C {bare} .venv/installed",
+        create_tree(tmp_path / "copied", ROOT): f"its .venv belongs to {ROOT}; to renew it: make",
     }
     for tree, reason in mistakes.items():
         with pytest.raises(Failure) as refused:

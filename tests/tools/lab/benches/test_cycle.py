@@ -1,5 +1,4 @@
-"""The bench of cycles: real racks in a short form, the parts of given traces, and the physics of a
-recorded run."""
+"""The bench of cycles: parts of given traces, comparisons, and the physics of a recorded run."""
 
 from __future__ import annotations
 
@@ -25,7 +24,7 @@ pytestmark = pytest.mark.thorough
 
 
 WHOLE = 1_000_000
-"""More ticks than any run."""
+"""More ticks than any run has."""
 TASK = wire(load("nasrem")).task("servo")
 
 

@@ -1,5 +1,4 @@
-"""cyclictest: its histogram as the lateness of every wake, and what it says when it is absent or
-refused."""
+"""cyclictest: the lateness of every wake from its histogram, its absence and its refusal."""
 
 from __future__ import annotations
 
@@ -37,7 +36,7 @@ def test_wakes_beyond_the_histogram_count_as_the_latest(
     assert found.max() == 150_000.0
 
 
-def test_a_refusal_is_a_failure_in_its_own_words(
+def test_a_refusal_by_cyclictest_is_a_failure_with_its_message(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PATH", str(peers.program(tmp_path, "cyclictest", peers.REFUSED)))
@@ -45,7 +44,7 @@ def test_a_refusal_is_a_failure_in_its_own_words(
         cyclictest(GRID)
 
 
-def test_it_is_absent_without_the_program_or_the_permission(
+def test_cyclictest_is_absent_without_the_program_or_the_permission(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
@@ -57,11 +56,10 @@ def test_it_is_absent_without_the_program_or_the_permission(
     assert "SCHED_FIFO is refused" in absent.line
 
 
-def test_a_wake_late_by_cycles_is_overdue_at_each_point_it_passed() -> None:
+def test_a_wake_is_late_at_each_grid_point_that_it_passed() -> None:
     period_ns = 1_000_000
     assert late_share([np.array([0.0, 999.0])], period_ns) == 0.0
-    # The second wake came 3.2 cycles late: three points are lost, two of which had no wake of their
-    # own.
+    # The second wake was 3.2 cycles late. It lost three points, two of which had no wake.
     assert late_share([np.array([0.0, 3200.0])], period_ns) == 3 / 4
     assert late_share([np.array([])], period_ns) == 0.0
     assert late_share([], period_ns) is None

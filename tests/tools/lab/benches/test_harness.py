@@ -1,4 +1,4 @@
-"""Comparisons: figures and ratios of given samples, the table, who is absent, and taking turns."""
+"""Comparisons: statistics and ratios, the table, absent contestants, and the order of calls."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ BOTH = Comparison("pair", "Two contestants", SAMPLES, {"small": "theirs", "large
 
 
 class Hidden:
-    """A finder that hides a package, as if it were not installed."""
+    """Finder that hides a package as if it were not installed."""
 
     def __init__(self, package: str) -> None:
         self._package = package
@@ -67,7 +67,7 @@ def test_ratios_are_to_the_baseline_of_the_same_case() -> None:
     assert Comparison("pair", "", SAMPLES, {}).ratio(small) is None
 
 
-def test_the_document_has_every_figure_and_says_who_is_absent() -> None:
+def test_the_document_has_every_statistic_and_names_absent_contestants() -> None:
     missing = Absent("cyclictest", "no program 'cyclictest'", "apt-get install rt-tests")
     found = replace(BOTH, absent=(missing,)).document()
     assert json.loads(json.dumps(found)) == found
@@ -79,7 +79,7 @@ def test_the_document_has_every_figure_and_says_who_is_absent() -> None:
     assert found["absent"] == [asdict(missing)]
 
 
-def test_the_table_fits_the_terminal_and_names_who_is_absent() -> None:
+def test_the_table_fits_the_terminal_and_names_absent_contestants() -> None:
     missing = Absent("iceoryx2", "No module named 'iceoryx2'", EXTRA)
     found = Comparison("pair", "Two contestants", SAMPLES, BOTH.baselines, (missing,))
     lines = list(render_text(found.blocks()))
@@ -89,7 +89,7 @@ def test_the_table_fits_the_terminal_and_names_who_is_absent() -> None:
     assert max(map(len, list(render_text(found.blocks(), 50))[1:-1])) <= 50
 
 
-def test_a_package_or_a_program_that_is_not_there_is_absent(
+def test_a_missing_package_or_program_is_absent(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     assert not absent_package("JSON", "json")
@@ -102,7 +102,7 @@ def test_a_package_or_a_program_that_is_not_there_is_absent(
     assert absent_cyclictest() == (missing,)
 
 
-def test_everybody_has_one_turn_a_round_and_no_fixed_neighbour() -> None:
+def test_each_contestant_is_called_once_per_round_in_a_changing_order() -> None:
     order: list[str] = []
     contestants = {name: partial(order.append, name) for name in "abcd"}
     interleaved(contestants, 50)

@@ -1,4 +1,4 @@
-"""The bench of launches: what it reads from a run, and the reactions to a kill."""
+"""The bench of launches: the first cycle of a run, and the reactions to a kill."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ from rack.tools.lab.benches.launch import (
 pytestmark = pytest.mark.thorough
 
 
-def recorded(folder: Path, tasks: list[str], started_ns: list[int]) -> Path:
-    """A run's folder, of which another version of the program has recorded the trace."""
+def write_trace(folder: Path, tasks: list[str], started_ns: list[int]) -> Path:
+    """Write the trace of a run as another version of the program records it."""
     pq.write_table(pa.table({"task": tasks, "start_ns": started_ns}), folder / "cycles.parquet")
     return folder
 
 
 def test_the_first_cycle_is_the_earliest_of_its_task(tmp_path: Path) -> None:
-    run = recorded(tmp_path, ["servo", "task", "servo", "servo"], [70, 10, 50, 60])
+    run = write_trace(tmp_path, ["servo", "task", "servo", "servo"], [70, 10, 50, 60])
     assert first_cycle_ns(run, "servo") == 50
 
 
 def test_a_run_without_a_cycle_of_the_task_is_a_failure(tmp_path: Path) -> None:
     with pytest.raises(Failure, match="no cycle of 'servo' was recorded"):
-        first_cycle_ns(recorded(tmp_path, ["task"], [10]), "servo")
+        first_cycle_ns(write_trace(tmp_path, ["task"], [10]), "servo")
 
 
-def test_the_fastest_executor_is_looked_for(small: Path) -> None:
+def test_the_board_with_the_shortest_period_is_found(small: Path) -> None:
     assert fastest(load(small)) == "lower"
     assert fastest(load("nasrem")) == "servo"
 

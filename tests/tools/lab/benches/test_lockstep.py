@@ -19,7 +19,7 @@ pytestmark = pytest.mark.thorough
 
 
 @pytest.mark.slow
-def test_levels_without_a_rack_write_what_they_write_in_one(
+def test_levels_write_the_same_messages_with_and_without_a_rack(
     tmp_path_factory: pytest.TempPathFactory,
 ) -> None:
     recording = Recording(nasrem_run(tmp_path_factory))

@@ -1,4 +1,4 @@
-"""The bench of the machine: a rack at other rates, which of them it holds, and the verdict."""
+"""The bench of the machine: a rack at other rates, the rates that it holds, and the verdict."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ FOUND = Machine("machine", "", SAMPLES, {}, who=WHO, is_fifo=True, rates=(HELD, 
 
 @pytest.fixture
 def waves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A config, next to which is the only program on the path."""
+    """Write a config into the only folder on the path."""
     monkeypatch.setenv("PATH", str(tmp_path))
     path = tmp_path / "waves.toml"
     path.write_text(PLAIN)
@@ -74,7 +74,7 @@ def test_a_rack_without_a_board_at_every_tick_is_refused() -> None:
     [
         (HELD, "held"),
         (MISSED, "not held: the rack is late"),
-        # A machine that is late itself is not fit, whatever the rack misses.
+        # A late machine is not fit, regardless of the rack's missed cycles.
         (replace(HELD, missed=0.02, late=0.0195), "not held: the machine is late"),
         # Without cyclictest every miss counts.
         (replace(HELD, late=None), "not held: the rack is late"),
@@ -85,7 +85,7 @@ def test_a_rate_is_held_up_to_its_bound(figures: RateFigures, verdict: str) -> N
     assert (figures.verdict, not figures.reason) == (verdict, verdict == "held")
 
 
-def test_the_verdict_comes_first_and_says_up_to_which_rate_and_why_no_further() -> None:
+def test_the_verdict_comes_first_with_the_highest_rate_and_the_reason() -> None:
     lines = list(FOUND.blocks())
     assert lines[:3] == [
         "fit for real time up to 400 Hz",
@@ -118,14 +118,14 @@ def test_the_rack_is_compared_with_cyclictest_and_with_idle_cores_awake(
     monkeypatch.setattr("rack.backplane.process.LATENCY_REQUEST", device)
     held = []
 
-    def look(
+    def record_and_note_latency(
         config: RackConfig, seconds: float | None, folder: Path, share: bool = True
     ) -> Recorded:
         fds = [one.readlink() for one in Path("/proc/self/fd").iterdir() if one.is_symlink()]
         held.append(device in fds)
         return record(config, seconds, folder, share)
 
-    monkeypatch.setattr(machine, "record", look)
+    monkeypatch.setattr(machine, "record", record_and_note_latency)
     found = measure(str(waves), (400,), 0.3, 2, True, Progress())
     # Of 120 wakes two rounds have two at 2.5 ms and four at 150 ms: 1 and 60 points of this grid.
     assert found.rates[0].late == pytest.approx((2 * 1 + 4 * 60) / (2 * 120 + 4 * 59))
@@ -143,18 +143,18 @@ def test_the_rack_is_compared_with_cyclictest_and_with_idle_cores_awake(
         # Ten lost cycles at 400 Hz outweigh every lateness within one, also a worse one.
         ((60.0,) * 11 + (2400.0,), (20.0, 20.0) + (2500.0,) * 10, "sleep"),
         ((9000.0,) * 10 + (60.0, 60.0), (20.0,) * 11 + (9001.0,), "awake"),
-        # One more may be chance: then the worst wake-up decides, never the median.
+        # One more may be chance. The worst wake-up then decides, never the median.
         ((60.0,) * 11 + (900.0,), (20.0,) * 11 + (2500.0,), "sleep"),
         ((20.0,) * 11 + (900.0,), (60.0,) * 11 + (300.0,), "awake"),
     ],
 )
-def test_the_setting_with_fewer_lost_cycles_suits_then_the_one_with_the_better_worst_wake_up(
+def test_idle_cores_are_chosen_by_lost_cycles_then_by_the_worst_wake_up(
     asleep: tuple[float, ...], awake: tuple[float, ...], suits: str
 ) -> None:
     own = [
         Sample("400 Hz", WHO, asleep, "us"),
         Sample("400 Hz", WHO + AWAKE, awake, "us"),
-        # However late it is, it decides nothing.
+        # The lateness of cyclictest has no effect.
         Sample("400 Hz", CYCLICTEST, (50_000.0,), "us"),
     ]
     line = compare_idle_cores(own, WHO)

@@ -1,5 +1,7 @@
-"""The bench of mailboxes: real transports, every message received as sent, nothing left, the best
-peer as baseline."""
+"""The bench of mailboxes with real transports.
+
+Every message is received as sent, nothing is left, and the best peer is the baseline.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,7 @@ from tests.tools.lab.benches.test_harness import Hidden
 pytestmark = pytest.mark.thorough
 
 
-def left_by(pid: int) -> list[str]:
+def list_leftovers(pid: int) -> list[str]:
     return [path.name for path in SHM_FOLDER.iterdir() if str(pid) in path.name]
 
 
@@ -38,24 +40,24 @@ def test_every_reader_receives_every_message_and_nothing_is_left(
 ) -> None:
     if absent_package(peer.name, peer.module):
         pytest.skip(f"{peer.module} is not installed")
-    user = get_context("spawn").Process(target=use, args=(peer, tmp_path))
+    user = get_context("spawn").Process(target=exchange_messages, args=(peer, tmp_path))
     user.start()
     try:
         user.join(BOUND_S)
         assert user.exitcode == 0
     finally:
         user.kill()
-    assert not left_by(user.pid or 0)
+    assert not list_leftovers(user.pid or 0)
     assert not list(tmp_path.iterdir())
 
 
-def use(peer: Peer, folder: Path) -> None:
+def exchange_messages(peer: Peer, folder: Path) -> None:
     tempfile.tempdir = str(folder)
     case = Case("2 kB", 3)
     with peer.opened(Bench.message_type.dtype(case.lengths), case.readers) as transport:
         # No name is left even while messages pass.
         assert not list(folder.iterdir())
-        assert not left_by(os.getpid())
+        assert not list_leftovers(os.getpid())
         for serial in range(1, 40):
             transport.message.id = serial
             transport.message.position[:] = np.arange(case.lengths["joints"]) + serial
@@ -64,7 +66,7 @@ def use(peer: Peer, folder: Path) -> None:
             sent = bytes(transport.message.raw)
             assert [bytes(message.raw) for message in received] == [sent] * 3
     assert not list(folder.iterdir())
-    assert not left_by(os.getpid())
+    assert not list_leftovers(os.getpid())
 
 
 def test_a_transport_that_loses_messages_is_noticed() -> None:
@@ -96,7 +98,7 @@ def test_the_baseline_of_a_case_is_its_best_peer() -> None:
     assert [found.ratio(sample) for sample in samples] == [0.75, 1.25, 1.0, None]
 
 
-def test_a_bench_measures_every_protocol_and_names_who_is_absent(
+def test_a_bench_measures_every_protocol_and_names_absent_contestants(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(sys, "meta_path", [Hidden("iceoryx2"), *sys.meta_path])
@@ -113,4 +115,4 @@ def test_a_bench_measures_every_protocol_and_names_who_is_absent(
     assert all(sample.count == 3 and sample.best > 0 for sample in found.samples)
     assert Absent("iceoryx2 blackboard", "No module named 'iceoryx2'", EXTRA) in found.absent
     assert set(found.baselines.values()) <= {peer.name for peer in PEERS}
-    assert not left_by(os.getpid())
+    assert not list_leftovers(os.getpid())

@@ -1,4 +1,4 @@
-"""A recorded rack: its cycles are counted by its own counters, and its lateness from its trace."""
+"""A recorded rack: its counters give the number of cycles, and its trace the lateness."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ LAYOUT = wire(loads(Chain(1, 400).text()))
 
 
 class Overslept(Recording):
-    """A recording of three cycles, of which the last overslept two releases."""
+    """Recording of three cycles, the last of which overslept two releases."""
 
     layout = LAYOUT
 

@@ -1,4 +1,4 @@
-"""Racks that break claims of the paper, run by the experiments of `rack reproduce`."""
+"""Racks that violate claims of the paper, run by the experiments of `rack reproduce`."""
 
 from __future__ import annotations
 
@@ -10,13 +10,14 @@ from rack.tools.lab.benches.observed import Recorded
 from rack.tools.lab.reproduction.experiments.experiment import Workshop
 
 CHAIN = "chain"
-"""The rack of empty boards, which has no name of its own."""
+"""Key of the rack of empty boards, which has no name."""
 
 
 class BreakingWorkshop(Workshop):
-    """Runs racks with `changes`, TOML by the name of the rack, each at most `most_s` long.
+    """Workshop that runs changed racks, each for at most `most_s`.
 
-    `scripts` are the faults that a script of that name holds instead, as TOML.
+    `changes` are TOML texts by the name of the rack. `scripts` are TOML texts that replace fault
+    scripts by name.
     """
 
     def __init__(
@@ -34,10 +35,9 @@ class BreakingWorkshop(Workshop):
         self.prepare()
 
     def source(self, name: str) -> str:
-        """Return the path of a changed config; a chain comes as text, and stays one.
+        """Return the path of a changed config, or the changed text of a chain.
 
-        A change that the chain cannot take is left out: of its own protocol, or an overrun in
-        lockstep.
+        Changes that a chain cannot take are left out: a second protocol, or an overrun in lockstep.
         """
         if "\n" in name:
             changes = self._changes.get(CHAIN, "")
@@ -53,13 +53,13 @@ class BreakingWorkshop(Workshop):
     def config(
         self, name: str, settings: Sequence[str] = (), faults: str | None = None
     ) -> RackConfig:
-        """Return a changed config, with the changed script of that name."""
+        """Load a changed config with the changed script of this name."""
         if faults in self._scripts:
             faults = self._written(f"script-{faults}", self._scripts[faults])
         return super().config(name, settings, faults)
 
     def run(self, label: str, config: RackConfig, seconds: float | None = None) -> Recorded:
-        """Run a rack, no longer than permitted."""
+        """Run a rack for no longer than permitted."""
         return super().run(label, config, min(seconds or self._most_s, self._most_s))
 
     def _written(self, name: str, text: str) -> str:

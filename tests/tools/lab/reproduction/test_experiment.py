@@ -1,4 +1,4 @@
-"""Experiments are kept, and made again only when what they depend on has changed."""
+"""Results are stored, and experiments repeated only if a dependency has changed."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from rack.tools.lab.reproduction.experiments.experiment import (
 
 @dataclass(frozen=True)
 class Times:
-    """How often an experiment was made."""
+    """Number of times that an experiment was made."""
 
     times: int
 
 
 class Counted:
-    """An experiment that counts how often it is made."""
+    """Experiment that counts its runs."""
 
     def __init__(self) -> None:
         self.times = 0
@@ -50,14 +50,14 @@ def workshop(tmp_path: Path) -> Workshop:
     return found
 
 
-def test_a_result_is_kept_until_the_program_changes_or_its_picture_is_gone(
+def test_a_result_is_valid_until_the_program_changes(
     workshop: Workshop, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     one = Counted().experiment()
     assert kept(one, workshop.folder) is None
     first = made(one, workshop)
     assert kept(one, workshop.folder) == first
-    # What it depends on stands next to it.
+    # The dependencies are stored with the result.
     document = json.loads((workshop.folder / KEPT / "counted.json").read_text())
     assert document["depends"] == json.loads(json.dumps(depends()))
     assert {"program", "machine"} <= set(document["depends"])
@@ -69,12 +69,12 @@ def test_a_result_is_kept_until_the_program_changes_or_its_picture_is_gone(
 @pytest.mark.parametrize(
     "rest", ['{"found": ', "[]", "{}", '{"found": 1, "took_s": 1, "made_at": "", "lacking": ""}']
 )
-def test_a_file_that_is_no_result_is_made_again(rest: str, workshop: Workshop) -> None:
+def test_an_experiment_with_an_invalid_result_is_made_again(rest: str, workshop: Workshop) -> None:
     (workshop.folder / KEPT / "counted.json").write_text(rest)
     assert kept(Counted().experiment(), workshop.folder) is None
 
 
-def test_what_the_machine_lacks_is_kept_as_a_reason_and_a_failure_is_not(
+def test_a_missing_requirement_is_stored_as_a_reason_and_a_failure_is_not(
     workshop: Workshop,
 ) -> None:
     def lack(workshop: Workshop) -> Times:
@@ -93,7 +93,7 @@ def test_what_the_machine_lacks_is_kept_as_a_reason_and_a_failure_is_not(
     assert kept(failing, workshop.folder) is None
 
 
-def test_results_depend_on_the_program_but_not_on_what_writes_the_page() -> None:
+def test_results_depend_on_the_program_but_not_on_the_modules_that_write_the_page() -> None:
     folders = {path.parent.name for path in program_files()}
     assert {"mailbox", "servo", "benches", "experiments", "configs"} <= folders
     assert not {"reproduction", "sections"} & folders

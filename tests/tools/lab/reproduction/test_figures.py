@@ -1,5 +1,4 @@
-"""Section 3.4 of the paper by computation: where figures 2 to 4 are what it says, and where they
-are not."""
+"""Section 3.4 of the paper by computation: figures 2 to 4 and the contradiction in figure 2."""
 
 from __future__ import annotations
 
@@ -28,8 +27,8 @@ def test_the_contradiction_of_figure_2_is_found_by_computation() -> None:
     assert describe_unmet(rows[3.0][1:]) == "X=3 cycles_per_plan 3, not <= 2"
 
 
-def ran(late: int, jobs: int = 100) -> FigureRun:
-    """Return what a run of a figure leaves, with so many late plans."""
+def build_run(late: int, jobs: int = 100) -> FigureRun:
+    """Return the record of a run of a figure with some late plans."""
     counts = {"level": Count(jobs), "level.planner": Count(jobs, late)}
     return FigureRun(counts, 0, 0)
 
@@ -45,14 +44,14 @@ FIGURES = [
     ("figure-3", (97, 0), Ruling.BOUNDED),
     ("figure-3", (0, 97), Ruling.FAILS),
     ("figure-2-x", (0, 100), Ruling.CONTRADICTS),
-    # Runs that do not confirm the contradiction make it no finding.
+    # Without runs that confirm it, the contradiction is not a finding.
     ("figure-2-x", (0, 0), Ruling.FAILS),
 ]
 
 
 @pytest.mark.parametrize(("name", "late", "ruling"), FIGURES)
 def test_a_figure_is_judged_by_its_runs(name: str, late: tuple[int, ...], ruling: Ruling) -> None:
-    assert rule_on(name, *map(ran, late)).ruling is ruling
+    assert rule_on(name, *map(build_run, late)).ruling is ruling
 
 
 def test_a_schedule_is_drawn_as_the_paper_draws_it() -> None:

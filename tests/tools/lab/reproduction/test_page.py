@@ -1,4 +1,4 @@
-"""The page as HTML, Markdown and data: whole by itself, and nothing of it lost."""
+"""The page as HTML, Markdown and data is self-contained and complete."""
 
 from __future__ import annotations
 
@@ -37,8 +37,7 @@ PAGE = Page(
 
 
 class Links(HTMLParser):
-    """Collects everything that a browser would fetch or follow, anchors, texts, and tags that are
-    not closed."""
+    """Collects links, anchors, texts and unclosed tags of a page."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -92,7 +91,7 @@ def test_markdown_keeps_charts_and_tables_whole() -> None:
     assert "- [3.3 Higher levels](#section-3.3)\n  - ↯ [Equation 3.8](#equation-3.8)" in document
 
 
-def test_data_are_plain() -> None:
+def test_the_page_converts_to_plain_data() -> None:
     data = json.loads(json.dumps(PAGE.document()))
     assert (data["facts"], data["rulings"]) == ({"cores": "2"}, {"contradicts": 1, "holds": 0})
     (section,) = data["sections"]

@@ -1,4 +1,4 @@
-"""The same rack, partitioned otherwise: its couplings and cores, and what is measured of it."""
+"""Partitions of a rack: couplings, cores and measurements."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.machine import needs_fifo, needs_two_cores
 pytestmark = pytest.mark.thorough
 
 
-def test_every_planner_is_coupled_the_same_way_on_so_many_cores() -> None:
+def test_a_partition_couples_every_planner_alike_and_uses_all_its_cores() -> None:
     config = load("nasrem")
     found = {f"{one.coupling}, {one.cores}": one.of(config) for one in PARTITIONS}
     assert list(found) == ["tight, 1", "loose, 1", "tight, 2", "loose, 2"]
@@ -41,10 +41,10 @@ def test_every_planner_is_coupled_the_same_way_on_so_many_cores() -> None:
     assert found["tight, 2"].board["world"].coupling == "none"
 
 
-def partitioned(
+def run_partitions(
     text: str, seconds: float, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> tuple[PartitionFigures, ...]:
-    """Run the partitions of the rack of a config."""
+    """Run the rack of a config in all partitions."""
     (folder / "rack.toml").write_text(text)
     monkeypatch.setattr(partition, "NAME", str(folder / "rack.toml"))
     monkeypatch.setattr(partition, "SECONDS", seconds)
@@ -59,7 +59,7 @@ def partitioned(
 def test_partitions_are_run_and_measured_one_after_another(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    found = partitioned(PLANNED, 0.3, tmp_path, monkeypatch)
+    found = run_partitions(PLANNED, 0.3, tmp_path, monkeypatch)
     assert tuple(one.partition for one in found) == PARTITIONS
     for one in found:
         cycles = {(task.board, task.role): task.cycles for task in one.tasks}

@@ -1,4 +1,4 @@
-"""`rack reproduce` as a command: one section by real runs, killed, continued, and kept."""
+"""`rack reproduce` as a command: one section by real runs that are killed and continued."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.alone
 @pytest.mark.slow
-def test_a_killed_command_leaves_no_half_result_and_goes_on(killed: Path) -> None:
+def test_a_killed_command_leaves_whole_results_and_can_be_continued(killed: Path) -> None:
     assert not list((killed / KEPT).iterdir())
     done = rack("reproduce", "--out", killed, "--only", SECTION, "--share", "--json")
     found = json.loads(done.stdout)

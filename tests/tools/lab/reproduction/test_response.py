@@ -1,5 +1,4 @@
-"""Responses to an operator: commands with room for each response, and a twin of a run that proves
-its serials."""
+"""Responses to an operator: the distance of commands, and a twin that verifies the serials."""
 
 from __future__ import annotations
 
@@ -25,7 +24,7 @@ from tests.shared_runs import nasrem_run
 pytestmark = pytest.mark.thorough
 
 
-def test_there_is_room_for_each_response() -> None:
+def test_each_command_follows_the_longest_response_to_the_previous_one() -> None:
     config = load("nasrem")
     layout = wire(config)
     found = command_paths(rack_timing(config, layout), layout)
@@ -53,6 +52,6 @@ def test_the_torque_of_a_run_differs_from_a_twin_at_the_predicted_tick(
     predicted = {command.given: command.predicted for command in found.measured}
     assert (predicted[2243], predicted[2500]) == (2256, 2712)
     assert first_difference(run, response._twin(workshop, 2712)) == 2712
-    # Without the first command there is none at all.
+    # A run has no difference from itself.
     assert first_difference(run, run) is None
     assert first_difference(run, Recording(nasrem_run(tmp_path_factory))) == 2256

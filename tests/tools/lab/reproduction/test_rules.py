@@ -1,5 +1,8 @@
-"""Rules and the table of claims: every section, equation and figure of the paper is in it, and
-every rule gives each of its rulings on records made up for it."""
+"""Rules and the table of claims.
+
+The table has every section, equation and figure of the paper. Every rule gives each of its rulings
+for invented records.
+"""
 
 from __future__ import annotations
 
@@ -60,12 +63,12 @@ def test_every_section_equation_and_figure_of_the_paper_is_on_the_page_in_its_or
     found = list_experiments(SECTIONS)
     assert len({one.name for one in found}) == len(found)
     assert sum(one.seconds for one in found) < 15 * 60
-    with pytest.raises(Failure, match=r"--only 6: no such section; permitted: abstract, 1, 2"):
+    with pytest.raises(Failure, match=r"--only 6: no such section; sections: abstract, 1, 2"):
         select_sections(["6"])
 
 
 @pytest.mark.parametrize("name", EQUATIONS)
-def test_each_equation_holds_in_nasrem_and_fails_in_the_rack_that_is_to_show_it(
+def test_each_equation_holds_in_nasrem_and_fails_in_its_counterexample(
     name: str,
 ) -> None:
     nasrem, failing = CLAIMS[name].predict()
@@ -78,7 +81,7 @@ def test_each_equation_holds_in_nasrem_and_fails_in_the_rack_that_is_to_show_it(
 
 
 def rule_on(name: str, *found: Any) -> ClaimVerdict:
-    """Return the verdict on a claim by results as they are read from their files."""
+    """Return the verdict on a claim by results that have passed through their file format."""
     claim = CLAIMS[name]
     pairs = list(zip(claim.experiments, found, strict=True))
     return claim.judge(
@@ -87,7 +90,7 @@ def rule_on(name: str, *found: Any) -> ClaimVerdict:
 
 
 def compared(mode: str, digest: str, miss: int | None = None, differs: int | None = None) -> Any:
-    """Return a run of which the digest counts."""
+    """Return a run with a digest."""
     difference = None if differs is None else Difference(differs, "servo.status")
     return ComparedRun(mode, digest, miss, difference)
 
@@ -103,7 +106,7 @@ EMPTY = ChainRun(5, 9, 0, {})
 
 
 def chains(lockstep: dict[int, int], realtime: dict[int, int]) -> Chains:
-    """Return chains by the cycles that messages took."""
+    """Return chains with the numbers of cycles that messages took."""
     return Chains(replace(EMPTY, took=lockstep), replace(EMPTY, took=realtime), EMPTY, EMPTY)
 
 
@@ -114,13 +117,13 @@ def goto(refused: bool, done_s: float) -> GotoRuns:
 
 
 def tables(*rows: str, ended: str = DONE) -> TableRuns:
-    """Return runs of which the undisturbed one fires the row "pick" alone."""
+    """Return runs in which only the row "pick" fires without a disturbance."""
     calm = TableRun(DONE, 9.0, 0.0, {}, None, ("pick",))
     return TableRuns(replace(calm, ended=ended, rows=rows), calm)
 
 
 def background(late: int, blocks: int, in_line: int) -> tuple[FigureRun, FigureRun]:
-    """Return a level of 100 cycles that stores blocks in the background, and in the cycle."""
+    """Return runs of 100 cycles in which blocks are stored in the background and in the cycle."""
     behind, line = (
         FigureRun({LEVEL: Count(100, bad), PLANNER: Count(blocks, 0)}, 0, 0)
         for bad in (late, in_line)
@@ -247,12 +250,12 @@ def test_a_rule_gives_each_of_its_rulings(name: str, found: Any, ruling: Ruling)
     assert (describe_unmet(verdict.checks) == "") == is_met
 
 
-def test_what_is_not_met_is_said_with_its_numbers() -> None:
+def test_unmet_comparisons_are_described_with_their_values() -> None:
     unmet = describe_unmet(rule_on("context-switch", switch(8.0)).checks)
     assert unmet == "switch_p99_us 9, not <= 8"
 
 
-def test_what_was_not_made_or_cannot_be_is_said_in_place() -> None:
+def test_a_claim_without_results_shows_the_reason() -> None:
     lacking = Kept({}, 1.0, "now", "this machine has one processor")
     for results, ruling, why in (
         ({}, Ruling.UNMADE, "nasrem: not run yet"),

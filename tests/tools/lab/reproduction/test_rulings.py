@@ -1,9 +1,9 @@
-"""Every ruling of the page can fail: for each claim a rack that breaks it, run by the claim's own
-experiments, and the demand that it does not meet; or records made up for it, in test_rules.py and
-test_figures.py.
+"""Every ruling of the page can fail.
 
-A row changes a rack by a few lines of TOML. What is run is short: the verdict counts, and which
-comparison gave it.
+For each claim there is a rack that violates it, with the comparison that is then not met, or there
+are invented records in test_rules.py and test_figures.py. The racks are run by the experiments of
+the claim. A row changes a rack by a few lines of TOML. Runs are short, because only the verdict and
+its comparisons count.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from tests.tools.lab.reproduction.test_rules import CLAIMS, RULINGS
 pytestmark = [pytest.mark.thorough, pytest.mark.slow, pytest.mark.timeout(300)]
 
 UNJUDGED = {"replication"}
-"""Claims on something that is not built: the page refuses to rule."""
+"""Claims on something that does not exist, on which the page refuses to rule."""
 LATE = """
 [[fault]]
 kind = "overrun"
@@ -70,7 +70,7 @@ board = "{board}"
 tick = 1
 """
 )
-"""A board is lost at once, and stays so."""
+"""A board is lost at once and not restarted."""
 NO_RESTART = "[supervision]\nrestarts = 0\n"
 ONE_LOSS = {
     "kill-each-board": """
@@ -88,16 +88,16 @@ at = 0.5
 for = "50ms"
 """,
 }
-"""Short scripts in place of those of whole tasks."""
+"""Short scripts that replace the scripts of whole tasks."""
 
 
 Judge = Callable[[BreakingWorkshop, PaperClaim], ClaimVerdict]
 FOUND: dict[tuple[str, str], Any] = {}
-"""What experiments have found, by their names and the racks: claims share some."""
+"""Records by the names of experiment and rack, because claims share some of them."""
 
 
 def by_experiments(workshop: BreakingWorkshop, claim: PaperClaim) -> ClaimVerdict:
-    """Return the ruling on what all experiments of a claim find."""
+    """Return the ruling by the records of all experiments of a claim."""
     found = []
     for one in claim.experiments:
         key = one.name, workshop.about
@@ -108,15 +108,17 @@ def by_experiments(workshop: BreakingWorkshop, claim: PaperClaim) -> ClaimVerdic
 
 
 def with_polling_later(workshop: BreakingWorkshop, claim: PaperClaim) -> ClaimVerdict:
-    """Return the ruling on a run in which polling is given the later times: no rack makes it so,
-    and on some machines it is so by itself."""
+    """Return the ruling on a run in which polling gets the later times.
+
+    No rack causes this reliably, and on some machines it happens without any change.
+    """
     found = WAITS.make(workshop)
     sooner, later = sorted((found.blocking_us, found.polling_us))
     return claim.judge(replace(found, blocking_us=sooner, polling_us=later))
 
 
 def by_one_system(name: str) -> Judge:
-    """Return a judge by the whole task of one system."""
+    """Return a judge that uses the whole task of one system."""
     return lambda workshop, claim: by_experiments(
         workshop,
         replace(claim, experiments=(tasks.TASKS[name],), judge=partial(judge_systems, [name])),
@@ -125,9 +127,9 @@ def by_one_system(name: str) -> Judge:
 
 @dataclass(frozen=True)
 class Breaking:
-    """A claim, a rack that breaks it, and the demand that is then not met, in part of its words.
+    """A claim, a rack that violates it, and part of the comparison that is then not met.
 
-    Of a healthy rack no demand is unmet. `alone`: it is run in real time.
+    A healthy rack meets all comparisons. Rows with `alone` run in real time.
     """
 
     claim: str
@@ -140,7 +142,7 @@ class Breaking:
 
     @property
     def rack(self) -> str:
-        """What it runs: rows of one rack share its runs."""
+        """Key of the rack. Rows with the same rack share its runs."""
         return f"{self.changes} {self.scripts} {self.seconds}" if self.changes else self.claim
 
 
@@ -226,7 +228,7 @@ ROWS = (
 
 @pytest.fixture(autouse=True)
 def _short(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Make runs short that no workshop makes."""
+    """Shorten runs that are not limited by the workshop."""
     monkeypatch.setattr(figures, "SECONDS", 1.0)
     monkeypatch.setattr(figures, "ATTEMPTS", 1)
     monkeypatch.setattr(sharing, "SECONDS", 0.7)
@@ -237,7 +239,7 @@ def _short(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def case(rack: str) -> Any:
-    """Return the rows of a rack as one case, which is alone if one of them is."""
+    """Return the rows of a rack as one case, marked `alone` if one of the rows is."""
     rows = [row for row in ROWS if row.rack == rack]
     marks = [pytest.mark.alone] * any(row.alone for row in rows)
     return pytest.param(rows, id=", ".join(row.claim for row in rows), marks=marks)

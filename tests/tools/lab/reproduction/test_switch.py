@@ -1,4 +1,4 @@
-"""The cost of a context switch: the gap in a planner's time, less the executor's time in it."""
+"""The context switch: the gap in a planner's time minus the executor's time in it."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from rack.tools.lab.reproduction.experiments.switch import measure_switch, switc
 from tests.machine import needs_fifo, needs_two_cores
 
 
-def test_what_a_gap_is_longer_than_the_executor_was_awake_are_two_switches() -> None:
+def test_a_gap_minus_the_executors_time_is_two_switches() -> None:
     gaps = np.array([[1_000, 51_000], [101_000, 171_000]])
     awake = np.array([[11_000, 31_000], [121_000, 131_000]])
     times = switch_times_us(gaps, awake)
     assert (times["min"], times["max"]) == (15.0, 30.0)
 
 
-def test_a_wake_up_outside_the_planners_time_is_no_switch_between_the_two() -> None:
+def test_a_wake_up_outside_the_planners_time_does_not_count_as_a_switch() -> None:
     gaps = np.array([[1_000, 51_000], [0, 0], [101_000, 111_000]])
     awake = np.array([[11_000, 31_000], [61_000, 62_000], [105_000, 112_000]])
     times = switch_times_us(gaps, awake)

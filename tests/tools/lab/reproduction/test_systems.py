@@ -1,4 +1,4 @@
-"""Systems next to each other, and how many levels their configs have."""
+"""The systems of the paper, and the number of levels in their configs."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_levels_are_read_from_a_config_alone() -> None:
     assert (levels.measured, faster.measured) == (4, 0)
 
 
-def test_a_rack_without_levels_above_each_other_has_no_two(tmp_path: Path) -> None:
+def test_a_rack_without_a_hierarchy_fails_the_claim_on_two_levels(tmp_path: Path) -> None:
     path = tmp_path / "lone.toml"
     path.write_text(PLAIN.replace('below = "wave"', 'reads = { below = "wave.status" }'))
     verdict = judge_layers([str(path)])

@@ -1,4 +1,4 @@
-"""Figure 5: levels among the regions of implementation, by their cycle."""
+"""Figure 5: levels in the regions of implementation by their cycles."""
 
 from __future__ import annotations
 
@@ -35,5 +35,5 @@ def test_the_levels_of_nasrem_fall_where_the_paper_has_them() -> None:
     }
     assert "coupled loosely, as in the figure" in found["elemental_move"].remark
     assert "coupled tightly, as in the figure" in found["task"].remark
-    assert "a processor of its own; here it is coupled tightly" in found["servo"].remark
+    assert "a separate processor; here it is coupled tightly" in found["servo"].remark
     assert "no planner" in found["world"].remark

@@ -1,5 +1,4 @@
-"""The chart of a run: spans cut where a higher priority had the core, jobs, and what was
-skipped."""
+"""The chart of a run: spans that are cut by higher priorities, jobs, and skipped releases."""
 
 from __future__ import annotations
 
@@ -15,7 +14,7 @@ from rack.tools.timing.charts.panel import union, without
 from tests.tools.recordings import cycle, recorded
 
 TICK_US = 2000
-"""A tick of the figures' clock; a cycle of fig2 has four."""
+"""A tick of the figures' clock, us. A cycle of fig2 has four ticks."""
 
 
 def executor(number: int, *moments_us: int, **more: int) -> tuple[int, ...]:
@@ -59,26 +58,26 @@ def test_a_cycle_becomes_its_unit_functions_at_their_times_on_the_grid(folder: P
     assert run.end_ns == 16_000_000
 
 
-def test_a_planner_has_the_core_only_while_its_executor_has_not(folder: Path) -> None:
+def test_a_planner_has_the_core_only_while_its_executor_does_not_run(folder: Path) -> None:
     cycles = [executor(0, 100, 100, 200, 300, 400), executor(1, 8100, 8100, 8200, 8300, 8400)]
     run = fig2(folder, cycles, [plan(0, 500, 9000, 9500)])
     planner = [found for found in spans(run.chart(0, run.end_ns)) if found[0] in "PU"]
     assert planner == [("P", 500, 8100), ("P", 8400, 9000), ("U", 9000, 9500)]
 
 
-def test_what_an_executor_needs_to_wake_up_is_not_its_planners(folder: Path) -> None:
+def test_wake_up_time_of_an_executor_is_cut_from_its_planner(folder: Path) -> None:
     # 150 us of processor time more than between start and end; released at 8000.
     cycles = [executor(1, 8200, 8200, 8200, 8300, 8400, processor_us=350)]
     run = fig2(folder, cycles, [plan(0, 500, 9000, 9500)])
     planner = [found for found in spans(run.chart(0, run.end_ns)) if found[0] == "P"]
     assert planner == [("P", 500, 8050), ("P", 8400, 9000)]
-    # It cannot have woken up before its release.
+    # The executor cannot wake up before its release.
     cycles = [executor(1, 8200, 8200, 8200, 8300, 8400, processor_us=5000)]
     run = fig2(folder, cycles, [plan(0, 500, 9000, 9500)])
     assert ("P", 500, 8000) in spans(run.chart(0, run.end_ns))
 
 
-def test_releases_that_were_skipped_are_jobs_that_were_never_done(folder: Path) -> None:
+def test_skipped_releases_are_jobs_without_an_end(folder: Path) -> None:
     late = executor(3, 24_000, 24_000, 24_000, 24_000, 25_000, skipped=2)
     run = fig2(folder, [executor(0, 0, 0, 0, 0, 21_000), late], [])
     chart = run.chart(0, run.end_ns)
@@ -91,7 +90,7 @@ def test_releases_that_were_skipped_are_jobs_that_were_never_done(folder: Path) 
     assert (counted.jobs, counted.late, counted.skipped) == (4, 3, 2)
 
 
-def test_what_a_planner_was_only_asked_is_no_plan(folder: Path) -> None:
+def test_a_release_without_a_plan_is_not_drawn(folder: Path) -> None:
     asked = cycle(4, TICK_US, 8500, 8500, 8550, 8600, 8700, skipped=1)
     run = fig2(folder, [], [plan(0, 500, 6000, 7000), asked])
     chart = run.chart(0, 100_000_000)
@@ -99,7 +98,7 @@ def test_what_a_planner_was_only_asked_is_no_plan(folder: Path) -> None:
     assert spans(chart) == [("P", 500, 6000), ("U", 6000, 7000)]
 
 
-def test_a_window_shows_what_began_long_before_it(folder: Path) -> None:
+def test_a_window_shows_spans_that_began_long_before_it(folder: Path) -> None:
     rows = [executor(n, *[n * 8000 + 100] * 4, n * 8000 + 200) for n in range(50)]
     run = fig2(folder, rows, [plan(0, 500, 300_000, 301_000)])
     assert [(found, start) for found, start, _ in spans(run.chart(200_000_000, 204_000_000))] == [
@@ -127,7 +126,7 @@ def test_patterns_and_counts_do_not_depend_on_the_blocks_that_are_read_at_once(
     assert dict(at_once.patterns["level"].plans) == {"R X W P | R X W P U -": 30}
 
 
-def test_every_moment_is_either_taken_or_left() -> None:
+def test_a_stretch_is_divided_into_busy_and_idle_parts() -> None:
     chance = random.Random(5)
     for _ in range(200):
         taken = union(

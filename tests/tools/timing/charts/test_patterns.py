@@ -1,4 +1,4 @@
-"""Patterns: the order of unit functions, by plan and by cycle."""
+"""Patterns: the order of unit functions in plans and in cycles."""
 
 from __future__ import annotations
 
@@ -23,28 +23,28 @@ EXECUTOR = task("a", "R100 X200 W100", 800)
 PLANNER = task("a.planner", "P600 U100", 800, 2, priority=0)
 
 
-def counted(tasks: list[TimedTask], lane: str, end: int, detail: Detail | None = None) -> Patterns:
+def count(tasks: list[TimedTask], lane: str, end: int, detail: Detail | None = None) -> Patterns:
     chart = simulate(tasks, 2 * end)
     found = next(found for found in lanes_of(tasks) if found.name == lane)
     return patterns(chart, found, (0, end), detail or Detail())
 
 
 def test_a_plan_has_one_pattern_over_all_its_cycles() -> None:
-    found = counted([EXECUTOR, PLANNER], "a", 16_000)
+    found = count([EXECUTOR, PLANNER], "a", 16_000)
     assert dict(found.plans) == {"R X W P | R X W P U -": 10}
     assert not found.cycles
 
 
-def test_a_planner_on_its_own_core_has_no_cycles_and_its_executor_no_plans() -> None:
+def test_a_planner_on_a_separate_core_has_no_cycles_and_its_executor_no_plans() -> None:
     tasks = [EXECUTOR, replace(PLANNER, core=2)]
-    assert dict(counted(tasks, "a.planner", 16_000).plans) == {"P U -": 10}
-    alone = counted(tasks, "a", 16_000)
+    assert dict(count(tasks, "a.planner", 16_000).plans) == {"P U -": 10}
+    alone = count(tasks, "a", 16_000)
     assert (dict(alone.plans), dict(alone.cycles)) == ({}, {"R X W -": 20})
 
 
 def test_cycles_in_which_no_plan_is_under_way_are_counted_apart() -> None:
     chart = simulate([EXECUTOR, PLANNER], 8000)
-    # Of five plans the last three are taken away, jobs and spans.
+    # Remove the jobs and spans of the last three of five plans.
     kept = tuple(job for job in chart.jobs if job.task == "a" or job.release_ns < 3200)
     spans = tuple(span for span in chart.spans if span.task == "a" or span.release_ns < 3200)
     found = patterns(
@@ -56,25 +56,25 @@ def test_cycles_in_which_no_plan_is_under_way_are_counted_apart() -> None:
 
 def test_a_core_that_another_board_has_is_not_idle() -> None:
     other = task("b", "X400", 800, priority=70)
-    assert dict(counted([EXECUTOR, other], "a", 8000).cycles) == {"R X W": 10}
-    assert dict(counted([EXECUTOR, other], "b", 8000).cycles) == {"X": 10}
+    assert dict(count([EXECUTOR, other], "a", 8000).cycles) == {"R X W": 10}
+    assert dict(count([EXECUTOR, other], "b", 8000).cycles) == {"X": 10}
 
 
 LANE = Lane(1, "a", "a", None, 80, 1000, 1000, 0)
 
 
-def order(*stretches: tuple[str, int, int], detail: Detail) -> str:
+def find_pattern(*stretches: tuple[str, int, int], detail: Detail) -> str:
     spans = tuple(Span("a", 1, Unit(unit), start, end, 0) for unit, start, end in stretches)
     found = patterns(Chart(0, 2000, spans, (Job("a", 0, 1000, 900),)), LANE, (0, 1000), detail)
     (pattern,) = found.cycles
     return pattern
 
 
-def test_remnants_and_short_gaps_are_not_told_of_what_was_measured() -> None:
+def test_measured_patterns_leave_out_remnants_and_short_gaps() -> None:
     detail = Detail.measured(LANE, {Unit.PLAN: 300, Unit.READ: 20})
     measured = (("P", 0, 15), ("R", 60, 75), ("X", 75, 400), ("P", 420, 990))
-    assert order(*measured, detail=detail) == "R X P"
-    assert order(*measured, detail=Detail()) == "P - R X - P -"
+    assert find_pattern(*measured, detail=detail) == "R X P"
+    assert find_pattern(*measured, detail=Detail()) == "P - R X - P -"
 
 
 @pytest.mark.parametrize("start", [0, 1, 799, 800])

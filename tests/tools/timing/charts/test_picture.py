@@ -1,4 +1,4 @@
-"""The chart as a picture: what is written in it fits; as letters it says what it leaves out."""
+"""Charts as pictures, whose letters fit, and in letters, which name the tasks left out."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from rack.tools.timing.charts.picture import WIDTH_IN, draw
 from rack.tools.timing.charts.scheduled import Schedule
 
 
-def panel_of(rack: str, start_ms: float, end_ms: float) -> Panel:
+def build_panel(rack: str, start_ms: float, end_ms: float) -> Panel:
     config = load(rack)
     schedule = Schedule(config, wire(config), {})
     return schedule.panel(round(start_ms * NS_PER_MS), round(end_ms * NS_PER_MS))
 
 
-def drawn(panel: Panel) -> tuple[list[Text], Figure]:
-    """Return the texts in the picture of a panel, laid out as it is saved."""
+def draw_texts(panel: Panel) -> tuple[list[Text], Figure]:
+    """Return the texts in the picture of a panel, with the layout of the saved picture."""
     figure = Figure(figsize=(WIDTH_IN, 5.0), layout="constrained")
     canvas = FigureCanvasAgg(figure)
     axes = figure.subplots()
@@ -39,8 +39,8 @@ def spans_ns(panel: Panel, letter: str) -> list[tuple[int, int]]:
 @pytest.mark.slow
 @pytest.mark.parametrize("end_ms", [2.0, 50.0])
 def test_a_letter_is_no_wider_than_its_span(end_ms: float) -> None:
-    panel = panel_of("nasrem", 0.0, end_ms)
-    texts, figure = drawn(panel)
+    panel = build_panel("nasrem", 0.0, end_ms)
+    texts, figure = draw_texts(panel)
     to_data = figure.axes[0].transData.inverted()
     letters = [text for text in texts if text.get_text() in {unit.value for unit in Unit}]
     assert letters
@@ -53,7 +53,7 @@ def test_a_letter_is_no_wider_than_its_span(end_ms: float) -> None:
 
 
 def test_the_numbers_of_frames_stand_above_their_columns() -> None:
-    panel = panel_of("cyclic", 0.0, 200.0)
+    panel = build_panel("cyclic", 0.0, 200.0)
     column_ns = column_for(200 * NS_PER_MS, None)
     frames = next(line for line in lines(panel, column_ns) if line.startswith("frame"))
     margin = frames.index("|")
@@ -61,8 +61,8 @@ def test_the_numbers_of_frames_stand_above_their_columns() -> None:
         assert frames[margin + 2 * number :].startswith(f"|{number}")
 
 
-def test_a_chart_in_letters_names_what_is_too_short_for_its_columns() -> None:
-    coarse = list(lines(panel_of("cell", 1000.0, 1200.0), 2 * NS_PER_MS))
+def test_a_chart_in_letters_names_tasks_that_are_too_short_for_its_columns() -> None:
+    coarse = list(lines(build_panel("cell", 1000.0, 1200.0), 2 * NS_PER_MS))
     assert "too short for a column: clock, lan, task; show less time, or see the picture" in coarse
-    fine = list(lines(panel_of("cell", 1000.0, 1008.0), NS_PER_MS // 10))
+    fine = list(lines(build_panel("cell", 1000.0, 1008.0), NS_PER_MS // 10))
     assert not [line for line in fine if line.startswith("too short")]

@@ -1,4 +1,4 @@
-"""Which stretch of time a chart shows, and what is refused."""
+"""The window of a chart, and refused windows."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ NASREM = [
 ]
 
 
-def test_a_window_shows_two_plans_of_the_slowest_level_whose_neighbours_can_still_be_seen() -> None:
+def test_a_default_window_shows_two_plans_of_the_slowest_level_that_fits() -> None:
     level = shown_task(NASREM)
     assert level.name == "primitive.planner"
     assert WindowOptions().window(level, None, 40 * MS) == (40 * MS, 120 * MS)
@@ -39,30 +39,30 @@ def test_a_window_shows_two_plans_of_the_slowest_level_whose_neighbours_can_stil
     [
         (3.5, 9.25, None, (3.5, 9.25)),
         (3, None, None, (3, 8)),
-        # A default end is cut at the end of the run.
+        # A default window ends with the run at the latest.
         (3, None, 5, (3, 5)),
     ],
 )
-def test_begin_and_end_are_as_they_are_asked_for(
+def test_a_window_begins_and_ends_as_requested(
     from_ms: float, to_ms: float | None, extent_ms: int | None, seen: tuple[float, float]
 ) -> None:
     extent = None if extent_ms is None else extent_ms * MS
-    start, end = asked(from_ms, to_ms).window(NASREM[0], extent, 0)
+    start, end = build_options(from_ms, to_ms).window(NASREM[0], extent, 0)
     assert (start / MS, end / MS) == seen
 
 
-def asked(from_ms: float | None, to_ms: float | None) -> WindowOptions:
-    """Return the options of these times."""
+def build_options(from_ms: float | None, to_ms: float | None) -> WindowOptions:
+    """Return the options for these times."""
     return WindowOptions(*(None if ms is None else round(ms * MS) for ms in (from_ms, to_ms)))
 
 
 @pytest.mark.parametrize(
     ("from_ms", "to_ms", "extent_ms", "message"),
     [
-        (90.0, 95.0, 80, "90 to 95 ms: outside the run, which lasts from 0 to 80 ms"),
-        (70.0, 81.0, 80, "70 to 81 ms: outside the run"),
+        (90.0, 95.0, 80, "90 to 95 ms: is outside the run, which lasts from 0 to 80 ms"),
+        (70.0, 81.0, 80, "70 to 81 ms: is outside the run"),
         (9.0, 9.0, 80, "9 to 9 ms: --to-ms must be later than --from-ms"),
-        # Nobody could read that.
+        # Such a chart would be unreadable.
         (0.0, 5000.1, 9000, "a chart shows at most 2000 cycles of 'servo', 5000 ms"),
     ],
 )
@@ -70,7 +70,7 @@ def test_a_bad_window_is_refused(
     from_ms: float, to_ms: float, extent_ms: int, message: str
 ) -> None:
     with pytest.raises(Failure, match=message) as failure:
-        asked(from_ms, to_ms).window(NASREM[0], extent_ms * MS, 0)
+        build_options(from_ms, to_ms).window(NASREM[0], extent_ms * MS, 0)
     assert failure.value.status == 2
 
 

@@ -1,9 +1,9 @@
-"""Experiments, and the folder that keeps what they found.
+"""Experiments, and the folder that stores their results.
 
-What an experiment found is kept as JSON with all that it depends on: the machine and the program,
-of which its configs and its own settings are parts. It is made again only if one of these has
-changed, or if it was not finished: a file appears whole or not at all, so even a killed command
-continues where it was.
+A result is stored as JSON together with everything on which it depends: the machine, and the
+program including its configs and settings. An experiment is repeated only if one of these has
+changed or if it was not finished. A file is written completely or not at all. A command that was
+killed therefore continues with the first missing experiment.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.lab.benches.cyclictest import permits_fifo
 from rack.tools.lab.benches.observed import UNVIEWED, Recorded, record
 
+# Subfolders for the results of experiments and for the recordings of their runs.
 KEPT = "parts"
 RUNS = "runs"
-"""In the folder: results of experiments, and recordings of their runs."""
 PROGRAM = Path(__file__).resolve().parents[4]
 FLOORS = ("backplane", "levels", "boards", "tools", "configs")
 RACK = "reproduce"
 """Prefix of the names of racks in shared memory."""
 NO_FIFO = (
-    "this machine refuses real-time priorities (SCHED_FIFO), so that an executor cannot preempt its"
-    " planner"
+    "this machine refuses real-time priorities (SCHED_FIFO); without them an executor cannot"
+    " preempt its planner"
 )
 LIBRARIES = ("mujoco", "numpy", "numba", "ompl", "ruckig")
 
@@ -51,16 +51,17 @@ Found = TypeVar("Found")
 
 
 class Lacking(Failure):
-    """The machine lacks what an experiment needs: its claims cannot be tested here, which is no
-    failure.
+    """Raised if this machine lacks something that an experiment needs.
+
+    The claims of the experiment are then untestable, which is not a failure.
     """
 
 
 class Workshop:
-    """The working folder of experiments, which holds the page.
+    """Working folder of experiments, which also contains the page.
 
     Attributes:
-        folder: The folder, absolute.
+        folder: Absolute path of the folder.
         share: Whether racks may run on cores that another rack holds.
     """
 
@@ -70,39 +71,50 @@ class Workshop:
 
     @property
     def rack(self) -> str:
-        """The name of its racks in shared memory: one runs at a time."""
+        """Name of its racks in shared memory. Only one of them runs at a time."""
         return f"{RACK}-{os.getpid()}"
 
     def prepare(self) -> None:
-        """Make the folders, and remove racks that a killed command has left in shared memory."""
+        """Create the folders, and remove racks that a killed command left in shared memory."""
         for name in (KEPT, RUNS):
             (self.folder / name).mkdir(parents=True, exist_ok=True)
         for rack in racks():
             if rack.startswith(f"{RACK}-"):
-                # That of a command which is running is in use.
+                # The rack of a running command is in use and cannot be removed.
                 with suppress(SegmentError):
                     remove_dead(rack)
 
     def config(
         self, name: str, settings: Sequence[str] = (), faults: str | None = None
     ) -> RackConfig:
-        """Return a config under the workshop's rack name, without a viewer's recording.
+        """Load a config under the workshop's rack name, without a recording for the viewer.
+
+        Args:
+            name: Name or text of the config.
+            settings: Changes to the config, as for `--set`.
+            faults: Name or path of a fault script. None for no script.
 
         Raises:
-            ConfigError: The config is not valid.
+            ConfigError: If the config is not valid.
         """
         return load(self.source(name), [*settings, *UNVIEWED, f"name={self.rack}"], faults)
 
     def source(self, name: str) -> str:
-        """Return the config that an experiment loads for a name or a text.
+        """Return the config that is loaded for a name or a text.
 
-        Tests override this to replace a rack by one that breaks a claim.
+        Tests override this method to substitute a rack that violates a claim.
         """
         return name
 
     def run(self, label: str, config: RackConfig, seconds: float | None = None) -> Recorded:
-        """Run a rack and return how it went and its recording, which stays in the folder; one of an
-        unfinished run is replaced.
+        """Run a rack and record it in the folder.
+
+        A recording of an earlier run with this label is replaced.
+
+        Args:
+            label: Name of the recording.
+            config: Rack to run.
+            seconds: Time of the run, s. None to run until a board ends it.
         """
         folder = self.folder / RUNS / label
         shutil.rmtree(folder, ignore_errors=True)
@@ -111,19 +123,19 @@ class Workshop:
 
 @dataclass(frozen=True, kw_only=True)
 class Charted:
-    """A record of which the page shows a chart in letters, or a table."""
+    """Record with a chart in letters, or a table, for the page."""
 
     chart: str = ""
 
 
 @dataclass(frozen=True)
 class Experiment(Generic[Found]):
-    """A measurement.
+    """A measurement for the page.
 
     Attributes:
-        name: Its name, and the name of the file that keeps its result.
-        about: Its description for the progress bar.
-        seconds: About how long it takes.
+        name: Name of the experiment and of the file that stores its result.
+        about: Description for the progress bar.
+        seconds: Approximate time that it takes, s.
         kind: Type of its record.
         measure: Runs it and returns the record. Raises `Failure`.
         cores: Number of processors needed for boards at real-time priorities. 0 if it does not need
@@ -138,31 +150,37 @@ class Experiment(Generic[Found]):
     cores: int = 1
 
     def make(self, workshop: Workshop) -> Found:
-        """Return what is found. Raises `Lacking` on a machine that lacks what it needs."""
+        """Run the experiment. Raises `RequirementMissing` if this machine does not suffice."""
         if self.cores and not permits_fifo():
             raise Lacking(NO_FIFO)
-        if (there := len(os.sched_getaffinity(0))) < self.cores:
-            raise Lacking(f"it needs {self.cores} processors; this machine has {there}")
+        if (available := len(os.sched_getaffinity(0))) < self.cores:
+            raise Lacking(f"it needs {self.cores} processors; this machine has {available}")
         return self.measure(workshop)
 
     def record(self, data: Any) -> Found:
-        """Return what was found, from plain data."""
+        """Convert plain data to a record."""
         return TypeAdapter(self.kind).validate_python(data)
 
-    def document(self, found: Found) -> Any:
-        """Return what was found as plain data."""
-        return TypeAdapter(self.kind).dump_python(found, mode="json")
+    def document(self, record: Found) -> Any:
+        """Convert a record to plain data."""
+        return TypeAdapter(self.kind).dump_python(record, mode="json")
 
 
 def depends() -> Document:
-    """Return all that a result depends on, as it is now."""
+    """Describe everything on which a result depends at present."""
     return {"program": program(), "machine": machine()}
 
 
 @dataclass(frozen=True)
 class Kept:
-    """A result that is kept: what was found, when, in which time, and what it depends on; or why
-    nothing can be found on this machine.
+    """A stored result of an experiment.
+
+    Attributes:
+        found: The record as plain data.
+        took_s: Time that the experiment took, s.
+        made_at: Local time at which it was finished.
+        lacking: Reason for which this machine cannot run the experiment. Empty if it can.
+        depends: Everything on which the result depends.
     """
 
     found: Any
@@ -173,7 +191,7 @@ class Kept:
 
 
 def kept(experiment: Experiment[Any], folder: Path) -> Kept | None:
-    """Return the result of an experiment if it is still right; None if it must be made."""
+    """Return the stored result of an experiment. None if it is missing or no longer valid."""
     try:
         text = (folder / KEPT / f"{experiment.name}.json").read_bytes()
         result = TypeAdapter(Kept).validate_json(text)
@@ -183,27 +201,27 @@ def kept(experiment: Experiment[Any], folder: Path) -> Kept | None:
 
 
 def made(experiment: Experiment[Any], workshop: Workshop) -> Kept:
-    """Make an experiment and keep its result. Raises `Failure` and what a rack raises."""
-    started = time.monotonic()
-    basis = depends()
-    found: Any = None
-    lacking = ""
+    """Run an experiment and store its result. Raises `Failure` and the exceptions of a rack."""
+    start_s = time.monotonic()
+    dependencies = depends()
+    data: Any = None
+    missing = ""
     try:
-        found = experiment.document(experiment.make(workshop))
+        data = experiment.document(experiment.make(workshop))
     except Lacking as reason:
-        lacking = str(reason)
+        missing = str(reason)
     if INTERRUPT.number:
-        # A signal ends a run in order, but before its time.
+        # After a signal the run has ended in order, but too early.
         INTERRUPT.end()
-    took_s = round(time.monotonic() - started, 1)
-    result = Kept(found, took_s, time.strftime("%Y-%m-%d %H:%M:%S"), lacking, basis)
+    took_s = round(time.monotonic() - start_s, 1)
+    result = Kept(data, took_s, time.strftime("%Y-%m-%d %H:%M:%S"), missing, dependencies)
     write_json(workshop.folder / KEPT / f"{experiment.name}.json", vars(result))
     return result
 
 
 @cache
 def machine() -> Document:
-    """Return what the figures depend on in this machine."""
+    """Describe the properties of this machine that affect the measurements."""
     cpu = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     model = next(
         (line.partition(":")[2].strip() for line in cpu if line.startswith("model name")),
@@ -230,7 +248,7 @@ def program() -> str:
 
 
 def program_files() -> Iterator[Path]:
-    """Yield the files that results depend on, which leaves out the files that write the page."""
+    """Yield the files on which results depend. The modules that write the page are left out."""
     page = Path(__file__).resolve().parents[1]
     for floor in FLOORS:
         for path in sorted((PROGRAM / floor).rglob("*.*")):

@@ -1,4 +1,4 @@
-"""Figures 2 to 4 of the paper run by real processes, and their planning computed for every X."""
+"""Figures 2 to 4 of the paper, run by real processes and computed for every X."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from rack.tools.timing.charts.measured import TracedRun
 from rack.tools.timing.charts.panel import Count, Panel
 from rack.tools.timing.charts.scheduled import Schedule
 
+# The paper's X, ms: "will range from 1 to 3 ms".
 LEAST_X = 1.0
 MOST_X = 3.0
-"""The paper's X, ms: "will range from 1 to 3 ms"."""
 SECONDS = 3.0
 ATTEMPTS = 3
-"""Most runs of a figure, until the cycles of its executor are in time."""
+"""Maximum number of runs of a figure until no cycle of its executor is disturbed."""
 LAUNCH_S = 2.5
+# Tasks of these racks.
 LEVEL = "level"
 PLANNER = "level.planner"
-"""Tasks of these racks."""
 STORING_MS = 30.0
-"""About how long a block takes to store."""
+"""Approximate time to store a block, ms."""
 MS = 1e-6
 
 
@@ -36,10 +36,10 @@ class FigureRack:
     """A figure of the paper.
 
     Attributes:
-        config: Its config.
-        cycles: Number of cycles that are drawn.
+        config: Name of its config.
+        cycles: Number of cycles to draw.
         label: Name of its experiment.
-        settings: Changes of the config.
+        settings: Changes to the config.
     """
 
     config: str
@@ -49,17 +49,17 @@ class FigureRack:
 
     @cached_property
     def rack(self) -> RackConfig:
-        """The config, loaded."""
+        """The loaded config."""
         return load(self.config, self.settings)
 
     @cached_property
     def schedule(self) -> Schedule:
-        """The schedule that follows from its budget."""
+        """Schedule that follows from the budget."""
         return Schedule(self.rack, wire(self.rack), {})
 
     @property
     def experiment(self) -> Experiment[FigureRun]:
-        """Its run by real processes."""
+        """Experiment that runs the figure by real processes."""
         return Experiment(
             self.label,
             f"{self.label} by real processes",
@@ -71,27 +71,32 @@ class FigureRack:
 
     @property
     def window_ns(self) -> int:
-        """The time that its charts show."""
+        """Time that the charts show, ns."""
         return self.cycles * self.rack.every(LEVEL) * self.rack.clock_ns
 
     def panel(self) -> Panel:
-        """Return its schedule from the first cycle on."""
+        """Compute the scheduled panel from the first cycle on."""
         return self.schedule.panel(0, self.window_ns)
 
     def letters(self, panel: Panel) -> str:
-        """Return a panel of this figure as the paper draws it."""
+        """Format a panel of this figure in letters, as the paper draws it."""
         column_ns = column_for(self.window_ns, self.schedule.shortest_ns)
         return "\n".join((self.label, *lines(panel, column_ns)))
 
 
 def settings_of(name: str, process_ms: float) -> tuple[str, ...]:
-    """Return the settings with which the executor of a figure takes this X, ms, in its budget and
-    on its board.
+    """Return the settings that give the executor of a figure a certain X.
+
+    They change both the budget and the parameters of the board.
+
+    Args:
+        name: Name of the config.
+        process_ms: X, ms.
     """
     board = load(name).board[LEVEL]
     assert board.budget is not None, "every figure has a budget"
-    own_ms = board.budget.process_ms - board.params["process_ms"]
-    computed_ms = max(process_ms - own_ms, 0.0)
+    fixed_ms = board.budget.process_ms - board.params["process_ms"]
+    computed_ms = max(process_ms - fixed_ms, 0.0)
     return (
         f"board.{LEVEL}.budget.process_ms={process_ms:g}",
         f"board.{LEVEL}.params.process_ms={computed_ms:.6g}",
@@ -103,13 +108,18 @@ def _with_x(name: str, cycles: int, process_ms: float) -> FigureRack:
     return FigureRack(name, cycles, label, settings_of(name, process_ms))
 
 
-def _storing(task: str, part: str) -> FigureRack:
-    """Return figure 2 with a task, "planner" or "executor", that stores data in this part."""
+def _storing(task: str, key: str) -> FigureRack:
+    """Build a variant of figure 2 in which a task stores data.
+
+    Args:
+        task: "planner" or "executor".
+        key: Key of the budget that contains the time for storing.
+    """
     settings = (
         f'board.{LEVEL}.{task}="{storing.__name__}:Storing{task.capitalize()}"',
-        f"board.{LEVEL}.budget.{part}={STORING_MS}",
-        # A planner that always has work would take what the kernel keeps from real-time
-        # priorities, 5 % of each second, for which it stops the executor, too.
+        f"board.{LEVEL}.budget.{key}={STORING_MS}",
+        # The kernel reserves 5 % of each second for ordinary scheduling. A planner that always has
+        # work would exhaust the rest, and the kernel would stop the executor as well.
         f"board.{LEVEL}.planner_priority=0",
     )
     return FigureRack("fig2", 6, f"fig2-{task}", settings)
@@ -134,7 +144,7 @@ class FigureRun(Charted):
     """A run of a figure.
 
     Attributes:
-        tasks: Jobs by task.
+        tasks: Number of jobs and late jobs by task.
         met: Number of updates of the plan during which the executor was released.
         preempted: Number of updates of the plan during which the executor began.
     """
@@ -144,17 +154,18 @@ class FigureRun(Charted):
     preempted: int
 
     def late(self, task: str) -> float:
-        """Return the part of a task's jobs that were late."""
+        """Return the fraction of a task's jobs that were late. 1 if it had no jobs."""
         count = self.tasks[task]
         return count.late / count.jobs if count.jobs else 1.0
 
 
 def _measure(figure: FigureRack, workshop: Workshop) -> FigureRun:
+    """Run a figure and draw the middle of the run."""
     run = _least_disturbed(figure, workshop)
-    start = run.middle_ns(next(task for task in run.tasks if task.name == PLANNER))
+    start_ns = run.middle_ns(next(task for task in run.tasks if task.name == PLANNER))
     executor = run.recording.trace(LEVEL)
     updates = plans(run.recording.trace(PLANNER))
-    panel = run.panel(start, start + figure.window_ns, lambda part: None)
+    panel = run.panel(start_ns, start_ns + figure.window_ns, lambda part: None)
     return FigureRun(
         tasks=dict(panel.counts),
         met=_within(updates, executor["release_ns"]),
@@ -164,24 +175,24 @@ def _measure(figure: FigureRack, workshop: Workshop) -> FigureRun:
 
 
 def _within(updates: np.ndarray, times_ns: np.ndarray) -> int:
-    """Return how many updates of a plan have one of these times in them."""
-    begun, ended = (np.searchsorted(times_ns, updates[at]) for at in ("process_ns", "end_ns"))
-    return int(np.count_nonzero(ended > begun))
+    """Return the number of updates of a plan that contain one of these times."""
+    first, last = (np.searchsorted(times_ns, updates[field]) for field in ("process_ns", "end_ns"))
+    return int(np.count_nonzero(last > first))
 
 
 def _least_disturbed(figure: FigureRack, workshop: Workshop) -> TracedRun:
-    """Return the run in which the fewest of the executor's cycles were late: other programs take
-    cores away.
+    """Return the run with the fewest late cycles of the executor.
 
-    An executor that is late by its own schedule runs once.
+    Other programs may take cores away, therefore a run with late cycles is repeated. An executor
+    that is late by its own schedule runs only once.
     """
-    tried: list[tuple[int, TracedRun]] = []
-    is_late = bool(figure.panel().chart.late(LEVEL))
+    runs: list[tuple[int, TracedRun]] = []
+    is_late_by_schedule = bool(figure.panel().chart.late(LEVEL))
     for attempt in range(1, ATTEMPTS + 1):
         config = workshop.config(figure.config, figure.settings)
         run = TracedRun(workshop.run(f"{figure.label}-{attempt}", config, SECONDS).recording)
         late = len(run.chart(0, run.end_ns).late(LEVEL))
-        tried.append((late, run))
-        if is_late or not late:
+        runs.append((late, run))
+        if is_late_by_schedule or not late:
             break
-    return min(tried, key=lambda one: one[0])[1]
+    return min(runs, key=lambda pair: pair[0])[1]

@@ -1,5 +1,7 @@
-"""NASREM: its whole task in real time, with every equation put to the run; the same messages in
-lockstep and in real time; losses and how soon they are over; and moves by a promised time.
+"""Experiments with NASREM.
+
+They are its whole task in real time with every equation applied to the run, the same messages in
+lockstep and in real time, losses and the times to recover from them, and moves by a promised time.
 """
 
 from __future__ import annotations
@@ -28,18 +30,18 @@ from rack.tools.report.analysis import Analysis, slice_ns
 
 NAME = "nasrem"
 TASK_S = 34.0
-"""About how long its whole task takes in real time."""
+"""Approximate time of the whole task in real time, s."""
 US = 1e-3
 MS = 1e-6
 COMPARED_S = 6.0
-"""Simulated time of runs that are compared, long enough for the arm to move."""
+"""Simulated time of runs that are compared, s. It is long enough for the arm to move."""
 LAUNCH_S = 3.0
 ATTEMPTS = 3
-"""Most compared runs in real time: one without a missed deadline is wanted."""
+"""Maximum number of compared runs in real time until one has no missed deadline."""
 ABOVE_M = 0.12
-"""A is so far above the place to which the rack's own program takes its first object."""
+"""Height of A above the place to which the rack's program takes its first object, m."""
 TOO_EARLY = 0.5
-"""Part of the time in soft time that is demanded first."""
+"""Fraction of the time in soft time that is demanded first."""
 GOTO_S = 32.0
 
 
@@ -53,9 +55,15 @@ class MeasuredVerdict:
 
 @dataclass(frozen=True)
 class ExecutorCycles:
-    """The cycles of an executor: judged ones, those missed or skipped of them, and all that it did.
+    """The cycles of an executor.
 
-    `communication_us` is the sum of the medians of C, R and W.
+    Attributes:
+        cycles: Number of judged cycles.
+        missed: Number of judged cycles that were missed or skipped.
+        done: Number of all cycles.
+        slice_ms: Time slice of the executor, ms.
+        largest_gap_ms: Largest time between two cycles, ms.
+        communication_us: Sum of the medians of C, R and W, us.
     """
 
     cycles: int
@@ -68,13 +76,13 @@ class ExecutorCycles:
 
 @dataclass(frozen=True)
 class NasremRun(TaskRun):
-    """The results of the run.
+    """Results of the whole task.
 
     Attributes:
         ticks: Length of the run.
-        verdicts: Every equation on every subject.
-        executors: Cycles by executor.
-        due: Number of messages by mailbox that its writer should have sent.
+        verdicts: Every equation for every subject.
+        executors: Cycles of each executor.
+        due: Number of messages that the writer of each mailbox should have sent.
     """
 
     ticks: int
@@ -110,24 +118,30 @@ NASREM = Experiment(NAME, "nasrem in real time, its whole task", TASK_S, NasremR
 
 
 def _executor(cycles: Cycles, rack: RackTiming) -> ExecutorCycles:
-    judged = cycles.is_judged
-    rows = cycles.rows[judged]
+    """Summarise the cycles of an executor."""
+    is_judged = cycles.is_judged
+    rows = cycles.rows[is_judged]
     parts_ns = (cycles.exchange_ns, cycles.read_ns, cycles.write_ns)
     return ExecutorCycles(
         cycles=len(rows),
         missed=sum(counts(rows)),
         done=len(cycles.rows),
         slice_ms=slice_ns(rack, cycles.task) * MS,
-        # Of all cycles: one that a stall prolonged leaves a gap too.
+        # Use all cycles, because a cycle that was prolonged by a stall leaves a gap as well.
         largest_gap_ms=float(gaps_ns(cycles.rows).max()) * MS,
-        communication_us=sum(float(np.median(part_ns[judged])) for part_ns in parts_ns) * US,
+        communication_us=sum(float(np.median(part_ns[is_judged])) for part_ns in parts_ns) * US,
     )
 
 
 @dataclass(frozen=True)
 class ComparedRun:
-    """The digest of a run, the tick of its first missed deadline, and where it diverges from the
-    first run.
+    """A run that is compared with the first one.
+
+    Attributes:
+        mode: Clock mode.
+        digest: Digest of the run.
+        first_miss: Tick of its first missed deadline. None if it has none.
+        difference: First difference from the first run. None if both are equal.
     """
 
     mode: str
@@ -137,7 +151,7 @@ class ComparedRun:
 
 
 def _compare_modes(workshop: Workshop) -> tuple[ComparedRun, ...]:
-    """Return runs in lockstep, then in real time."""
+    """Run the rack twice in lockstep, then in real time until no deadline is missed."""
     first, second = (_recorded(workshop, f"{NAME}-lockstep-{k}", "lockstep") for k in (1, 2))
     runs = [_compared(first, None), _compared(second, first.recording)]
     for attempt in range(1, ATTEMPTS + 1):
@@ -163,6 +177,7 @@ def _recorded(workshop: Workshop, label: str, mode: str) -> Recorded:
 
 
 def _compared(run: Recorded, reference: Recording | None) -> ComparedRun:
+    """Return the digest of a run, and its first difference from a reference."""
     result, recording = run
     return ComparedRun(
         mode=recording.rack_config.clock.mode,
@@ -174,7 +189,12 @@ def _compared(run: Recorded, reference: Recording | None) -> ComparedRun:
 
 @dataclass(frozen=True)
 class LossesRun:
-    """A run with a script of faults: each fault, and whether the run worked."""
+    """A run with a script of faults.
+
+    Attributes:
+        faults: Verdict on each fault.
+        worked: Whether the task was done.
+    """
 
     faults: tuple[Judgement, ...]
     worked: bool
@@ -183,8 +203,8 @@ class LossesRun:
 def _measure_losses(script: str, workshop: Workshop) -> LossesRun:
     """Run the rack's whole task in real time with a script of faults."""
     result, recording = workshop.run(script, workshop.config(NAME, (), script))
-    found = faults(recording.events, recording.layout)["faults"]
-    return LossesRun(TypeAdapter(tuple[Judgement, ...]).validate_python(found), result.worked)
+    judgements = faults(recording.events, recording.layout)["faults"]
+    return LossesRun(TypeAdapter(tuple[Judgement, ...]).validate_python(judgements), result.worked)
 
 
 KILLS, SENSORS = (
@@ -198,13 +218,13 @@ KILLS, SENSORS = (
 
 @dataclass(frozen=True)
 class GotoRun:
-    """A run of GOTO A, GOTO B, s.
+    """A run of GOTO A, GOTO B.
 
     Attributes:
-        by_s: Time by which A was demanded; None for soft time.
-        done_s: End of the cycle in which the task level reported A done; None if it never did.
-        earliest_s: Time that a refusal named instead; None without a refusal.
-        moved: Whether the arm did a move.
+        by_s: Time by which A was demanded, s. None for soft time.
+        done_s: End of the cycle in which the task level reported A done, s. None if it never did.
+        earliest_s: Earliest possible time that a refusal named, s. None without a refusal.
+        moved: Whether the arm made a move.
     """
 
     by_s: float | None
@@ -215,18 +235,19 @@ class GotoRun:
 
 @dataclass(frozen=True)
 class GotoRuns:
-    """A by a time that is too early, and by one that can be met."""
+    """Runs of A by a time that is too early, and by one that can be met."""
 
     early: GotoRun
     met: GotoRun
 
 
 def _measure_goto(workshop: Workshop) -> GotoRuns:
+    """Run GOTO A in soft time, by a time that is too early, and by a possible time."""
     soft = _goto(workshop, "goto", None)
     if soft.done_s is None:
         raise Failure("goto without a time was not done")
     early = _goto(workshop, "goto-too-early", round(TOO_EARLY * soft.done_s, 2))
-    # Without a refusal, the time of the first run is demanded.
+    # Without a refusal, demand the time of the first run.
     by_s = ceil((early.earliest_s or soft.done_s) * 10) / 10
     return GotoRuns(early, _goto(workshop, "goto-by", by_s))
 
@@ -235,8 +256,14 @@ DEADLINE = Experiment("goto", "goto in soft time, and by a time", GOTO_S, GotoRu
 
 
 def _goto(workshop: Workshop, label: str, by_s: float | None) -> GotoRun:
-    """Run GOTO A, above the goal of the first object that the program moves, then GOTO B, the
-    start.
+    """Run GOTO A, GOTO B.
+
+    A is above the goal of the first object that the program moves. B is the start.
+
+    Args:
+        workshop: Folder and settings of the run.
+        label: Name of the recording.
+        by_s: Time by which A is demanded, s. None for soft time.
     """
     x, y, z = next(action["to"] for action in load(NAME).task["action"] if "to" in action)
     by = "" if by_s is None else f", by = {by_s!r}"

@@ -1,4 +1,4 @@
-"""Partitions of levels over processors: the same rack, run in real time in each."""
+"""Partitions of levels over processors: the same rack runs in real time in each of them."""
 
 from __future__ import annotations
 
@@ -16,13 +16,16 @@ from rack.tools.report.analysis import core_loads
 
 NAME = "nasrem"
 SECONDS = 12.0
-"""By half of it every level has planned in lockstep; on one processor it takes longer."""
+"""Time of a run, s.
+
+In lockstep every level has planned by half of it. On one processor this takes longer.
+"""
 LAUNCH_S = 3.0
 
 
 @dataclass(frozen=True)
 class Partition:
-    """One way of placing levels on processors. A board keeps its core, modulo `cores`."""
+    """A placement of levels on processors. Each board keeps its core, modulo `cores`."""
 
     coupling: Coupling
     cores: int
@@ -30,7 +33,8 @@ class Partition:
     def of(self, config: RackConfig) -> RackConfig:
         """Return the rack in this partition, in real time.
 
-        A loose planner gets its own board on the next core; with only one core, on the same one.
+        A loose planner gets a separate board on the next core, or on the same core if there is only
+        one.
 
         Raises:
             ConfigError: If the rack does not permit this partition.
@@ -42,16 +46,16 @@ class Partition:
             update={"mode": "realtime", "core": config.clock.core % self.cores}
         )
         changed = config.model_copy(update={"board": boards, "clock": clock})
-        # A copy is not validated: load and check it like a user's config.
+        # A copy is not validated, therefore load and check it like a user's config.
         return resolve(loads(changed.text())).config
 
-    def _board(self, board: BoardConfig, free: Iterator[int]) -> BoardConfig:
+    def _board(self, board: BoardConfig, free_slots: Iterator[int]) -> BoardConfig:
         core = board.core % self.cores
         changes: dict[str, object] = {"core": core, "planner_slot": None, "planner_core": None}
         if board.planner is not None:
             changes["coupling"] = self.coupling
         if board.planner is not None and self.coupling == "loose":
-            changes |= {"planner_slot": next(free), "planner_core": (core + 1) % self.cores}
+            changes |= {"planner_slot": next(free_slots), "planner_core": (core + 1) % self.cores}
         return board.model_copy(update=changes)
 
 
@@ -62,7 +66,7 @@ PARTITIONS: tuple[Partition, ...] = tuple(
 
 @dataclass(frozen=True)
 class TaskFigures:
-    """A task in a run: its cycles, of a planner its plans, those missed, and releases skipped."""
+    """Counts of a task in a run. For a planner, plans are counted instead of cycles."""
 
     board: str
     role: str
@@ -73,8 +77,12 @@ class TaskFigures:
 
 @dataclass(frozen=True)
 class PartitionFigures:
-    """The measurements of one partition; `loads` are the parts of each core's time that its tasks
-    used.
+    """Measurements of one partition.
+
+    Attributes:
+        partition: The partition.
+        tasks: Counts of each task.
+        loads: Fraction of each core's time that the tasks used.
     """
 
     partition: Partition
@@ -84,9 +92,9 @@ class PartitionFigures:
 
 def _measure(workshop: Workshop) -> tuple[PartitionFigures, ...]:
     config = workshop.config(NAME)
-    # All of them are checked before the first one runs.
+    # Check all configs before the first rack runs.
     racks = [(partition, partition.of(config)) for partition in PARTITIONS]
-    return tuple(_figures(workshop, *one) for one in racks)
+    return tuple(_figures(workshop, *pair) for pair in racks)
 
 
 PARTITION = Experiment(
@@ -100,16 +108,16 @@ PARTITION = Experiment(
 
 
 def _figures(workshop: Workshop, partition: Partition, rack: RackConfig) -> PartitionFigures:
-    label = f"partition-{partition.coupling}-{partition.cores}"
-    run = workshop.run(label, rack, SECONDS).recording
+    """Run a rack in a partition, and return the counts of its tasks."""
+    run = workshop.run(f"partition-{partition.coupling}-{partition.cores}", rack, SECONDS).recording
     loads = core_loads(run, cycles_of(run), rack_timing(run.rack_config, run.layout))
     return PartitionFigures(partition, tuple(_task(task, run) for task in run.layout.tasks), loads)
 
 
 def _task(task: TaskSpec, run: Recording) -> TaskFigures:
+    """Count the cycles of a task, or the plans of a planner."""
     rows = run.trace(task.name)
-    # Releases without a plan are traced only if they were late; of them only the skipped releases
-    # count.
+    # Releases without a plan are traced only if they were late. Only their skipped releases count.
     _, skipped = counts(rows)
     if task.role == "planner":
         rows = plans(rows)

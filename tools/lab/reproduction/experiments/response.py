@@ -1,9 +1,8 @@
-"""The response of a rack to its operator: holds and resumes at ticks that were drawn at random.
+"""Response of a rack to its operator: holds and resumes at randomly drawn ticks.
 
-A twin of the run in lockstep, without one command, checks the serials that the measurement rests
-on. Until the tick at which the torque first rests on that command both runs are
-equal bit for bit. If the command was a hold given to a moving arm, they differ from exactly that
-tick on.
+A second lockstep run without one of the commands, the twin, checks the serials on which the
+measurement rests. Up to the tick at which the torque first rests on that command, both runs are
+equal bit for bit. If the command was a hold of a moving arm, they differ from exactly that tick on.
 """
 
 from __future__ import annotations
@@ -29,28 +28,30 @@ HOLDS = (
     ("elemental_move", 5659, 6300),
     ("task", 6713, 7848),
 )
-"""The levels that are held, with the ticks of the hold and of the resume; each is after the
-longest response to the one before."""
+"""Levels that are held, with the ticks of the hold and of the resume.
+
+Each command follows the previous one by more than the longest response.
+"""
 MOVING_AT = 5659
-"""Tick of the hold that meets a moving arm."""
+"""Tick of the hold that is given while the arm moves."""
 RUN_S = 24.0
-"""Simulated time of one run, at most."""
+"""Longest simulated time of a run, s."""
 LASTS_S = 62.0
 TWIN_EXTRA_TICKS = 40
 """Number of ticks that the twin runs after the predicted one."""
 STATUS = "servo.status"
-"""The status of the lowest level, with the torque."""
+"""Mailbox of the status of the lowest level, which contains the torque."""
 
 
 @dataclass(frozen=True)
 class ResponseRun(Charted):
-    """Commands of an operator in lockstep and in real time.
+    """Responses to an operator in lockstep and in real time.
 
     Attributes:
         lockstep: Responses in lockstep.
         realtime: Responses in real time.
-        predicted: First tick at which the torque in lockstep should differ without the hold at
-            `MOVING_AT`.
+        predicted: Predicted first tick at which the torque in lockstep differs without the hold at
+            `MOVING_HOLD_TICK`.
         differs: First tick at which it differs in any bit. None if it never does.
     """
 
@@ -63,7 +64,7 @@ class ResponseRun(Charted):
 def _measure(workshop: Workshop) -> ResponseRun:
     run, lockstep = run_commanded(workshop, "lockstep")
     _, realtime = run_commanded(workshop, "realtime")
-    predicted = next((one.predicted for one in lockstep.commands if one.given == MOVING_AT), None)
+    predicted = next((c.predicted for c in lockstep.commands if c.given == MOVING_AT), None)
     if predicted is None:
         raise Failure(f"{NAME}: no hold was given at tick {MOVING_AT}")
     return ResponseRun(
@@ -81,17 +82,17 @@ RESPONSE = Experiment(
 
 
 def run_commanded(workshop: Workshop, mode: str) -> tuple[Recording, OperatorResponse]:
-    """Run the rack in a mode with all commands. Raises `Failure` if none had a response."""
+    """Run the rack with all commands. Raises `Failure` if none of them had a response."""
     config = with_commands(workshop.config(NAME, [f"clock.mode={mode}"]), list_commands())
     run = workshop.run(f"response-{mode}", config, RUN_S).recording
     response = response_of(run)
     if response is None or not response.measured:
-        raise Failure(f"{NAME}: a run without a response to any command")
+        raise Failure(f"{NAME}: no command of the run had a response")
     return run, response
 
 
 def _twin(workshop: Workshop, predicted: int) -> Recording:
-    """Run the rack in lockstep with the commands before `MOVING_AT` alone."""
+    """Run the rack in lockstep with only the commands before `MOVING_HOLD_TICK`."""
     config = workshop.config(NAME, ["clock.mode=lockstep"])
     before = [command for command in list_commands() if (command.tick or 0) < MOVING_AT]
     seconds = (predicted + TWIN_EXTRA_TICKS) * config.clock_ns * 1e-9
@@ -99,7 +100,7 @@ def _twin(workshop: Workshop, predicted: int) -> Recording:
 
 
 def list_commands() -> list[CommandConfig]:
-    """Return the holds and resumes of a run, in their order."""
+    """Return the holds and resumes of a run in chronological order."""
     return [
         command
         for level, hold, resume in HOLDS
@@ -111,11 +112,13 @@ def list_commands() -> list[CommandConfig]:
 
 
 def first_difference(first: Recording, second: Recording) -> int | None:
-    """Return the first tick at which the torques of two runs in lockstep differ in any bit, over
-    the ticks that both have; None if they never do.
+    """Return the first tick at which the torques of two lockstep runs differ in any bit.
+
+    Only ticks that both runs contain are compared. None if the torques never differ.
     """
     torques = [run.signal(STATUS, "torque").view(np.uint64) for run in (first, second)]
-    # In lockstep the level writes in every cycle: messages of the same number have the same tick.
+    # In lockstep the level writes in every cycle, therefore messages with the same index have the
+    # same tick.
     length = min(map(len, torques))
-    differ = (torques[0][:length] != torques[1][:length]).any(axis=1)
-    return next(iter(first.signal(STATUS, "tick")[:length][differ].tolist()), None)
+    is_different = (torques[0][:length] != torques[1][:length]).any(axis=1)
+    return next(iter(first.signal(STATUS, "tick")[:length][is_different].tolist()), None)

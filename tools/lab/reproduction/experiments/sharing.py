@@ -1,5 +1,7 @@
-"""Boards that share processors and the backplane: chains of boards, with and without locks, and
-ways of waiting for a cycle.
+"""Boards that share processors and the backplane.
+
+Chains of boards run with and without locks, and single boards wait for their cycles by blocking and
+by polling.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ from rack.tools.lab.benches.observed import Recorded, count_cycles, lateness_us
 from rack.tools.lab.reproduction.experiments.experiment import Experiment, Workshop
 
 LEVELS = 5
-"""Levels of the pipeline: "it would take 5 control cycles"."""
+"""Number of levels of the pipeline: "it would take 5 control cycles"."""
 GROWN = 10
 RATE_HZ = 400
 SECONDS = 2.0
@@ -31,9 +33,9 @@ class ChainRun:
 
     Attributes:
         boards: Number of boards.
-        due: Number of cycles due.
-        missed: Number of cycles missed or skipped.
-        took: Number of messages by the cycles that they took.
+        due: Number of due cycles.
+        missed: Number of missed or skipped cycles.
+        took: Number of messages by the number of cycles that they took.
     """
 
     boards: int
@@ -44,7 +46,7 @@ class ChainRun:
 
 @dataclass(frozen=True)
 class Chains:
-    """The pipeline in lockstep and in real time, one with locks, and one that has grown."""
+    """Runs of the pipeline in lockstep, in real time, with locks, and with more boards."""
 
     lockstep: ChainRun
     realtime: ChainRun
@@ -62,11 +64,12 @@ def _measure_chains(workshop: Workshop) -> Chains:
 
 
 def _chain(label: str, workshop: Workshop, chain: Chain, protocol: str = "") -> ChainRun:
+    """Run a chain of boards, and count the cycles that its messages took."""
     run = _run(label, workshop, chain, protocol)
     missed, due = count_cycles(run.result.tasks[name] for name in chain.names)
     last = f"{chain.names[-1]}.status"
     sent, visible_at = (run.recording.signal(last, name) for name in ("sent", "visible_at"))
-    # A message that a miss repeats counts once. It is -1 before the first one.
+    # Count a message once, even if a missed cycle repeats it. -1 is sent before the first message.
     sent, first = np.unique(sent, return_index=True)
     took = Counter((visible_at[first] - sent)[sent >= 0].tolist())
     return ChainRun(chain.boards, due, missed, dict(sorted(took.items())))
@@ -89,9 +92,7 @@ CHAINS = Experiment(
 
 @dataclass(frozen=True)
 class Waits:
-    """The median of how late an empty board starts its cycles, us, if it blocks until them, and if
-    it polls.
-    """
+    """Median lateness of the cycles of an empty board that blocks, and of one that polls, us."""
 
     blocking_us: float
     polling_us: float

@@ -1,4 +1,4 @@
-"""Levels of figure 2 that store data, in the background or in the cycle of the executor."""
+"""Levels of figure 2 that store data, in the background or in the executor's cycle."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from typing import IO
 from rack.levels.systems.figures import FigureExecutor, FigurePlanner
 
 BLOCK_BYTES = 1 << 20
-"""Size of a block; to compress it takes several of the figure's cycles."""
+"""Size of a block. Its compression takes several of the figure's cycles."""
 
 
 class Storage:
-    """Secondary storage: a file without a name, gone with its process."""
+    """Secondary storage: an unnamed file that disappears with its process."""
 
     def __init__(self) -> None:
         self._block = os.urandom(BLOCK_BYTES)
@@ -25,28 +25,28 @@ class Storage:
         return tempfile.TemporaryFile()
 
     def put(self) -> None:
-        """Compress a block, write it in place of the one before, and force it to the disk."""
+        """Compress a block, overwrite the previous one in the file, and force it to the disk."""
         os.pwrite(self._file.fileno(), zlib.compress(self._block), 0)
         os.fsync(self._file.fileno())
 
 
 class StoringPlanner(FigurePlanner):
-    """Stores a block as each plan: in the background, and preempted by the executor."""
+    """Planner that stores a block as each plan, in the background, where it can be preempted."""
 
     storage = Storage()
 
     def plan(self, tick: int) -> None:
-        """Report, then store."""
+        """Write the plan, then store a block."""
         self.output.made_at = tick
         self.storage.put()
 
 
 class StoringExecutor(FigureExecutor):
-    """Stores a block in every cycle, as no executor should."""
+    """Executor that stores a block in every cycle, as no executor should."""
 
     storage = Storage()
 
     def process(self, tick: int) -> None:
-        """Compute, then store."""
+        """Run the cycle of the figure, then store a block."""
         super().process(tick)
         self.storage.put()

@@ -1,8 +1,8 @@
-"""The context switch t_cs of eqs 3.8 and 3.9: an executor wakes up while its planner computes on
-the same core.
+"""Measurement of the context switch t_cs of equations 3.8 and 3.9.
 
-The planner reads the clock in a loop until it sees a gap; the executor notes when it was awake. The
-gap without the executor's time is the two switches.
+An executor wakes up while its planner computes on the same core. The planner reads the clock in a
+loop until it sees a gap, and the executor notes the times at which it was awake. The gap minus the
+executor's time is the time of two switches.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ PAPER_US = 100.0
 WAKES = 1000
 PERIOD_S = 0.002
 HEAD_START_S = 0.0005
+# SCHED_FIFO priorities. No task under ordinary scheduling runs between the two.
 EXECUTOR = 80
 PLANNER = 1
-"""SCHED_FIFO priorities: no task under ordinary scheduling runs between the two."""
 PATIENCE_NS = 20_000_000
 READY_S = 20.0
 LAUNCH_S = 3.0
@@ -42,8 +42,12 @@ LAUNCH_S = 3.0
 
 @dataclass(frozen=True)
 class SwitchRun:
-    """The context switch t_cs of this machine, us, half of both switches around each wake-up that
-    interrupted the planner; and the one that the config assumes, us.
+    """The context switch t_cs of this machine.
+
+    Attributes:
+        switch_us: Half the time of both switches around each wake-up that interrupted the planner,
+            us.
+        assumed_us: Time that the config assumes, us.
     """
 
     switch_us: Distribution
@@ -51,8 +55,7 @@ class SwitchRun:
 
 
 def _measure(workshop: Workshop) -> SwitchRun:
-    assumed_us = 1e3 * workshop.config(NAME).timing.context_switch_ms
-    return SwitchRun(measure_switch(), assumed_us)
+    return SwitchRun(measure_switch(), 1e3 * workshop.config(NAME).timing.context_switch_ms)
 
 
 SWITCH = Experiment(
@@ -61,7 +64,7 @@ SWITCH = Experiment(
 
 
 class _Shared(NamedTuple):
-    """Shared by both processes. `gaps` and `awake` hold two times per wake-up, ns."""
+    """Data shared by both processes. `gaps` and `awake` contain two times per wake-up, ns."""
 
     parent: int
     core: int
@@ -72,8 +75,10 @@ class _Shared(NamedTuple):
 
 
 def measure_switch() -> Distribution:
-    """Measure on the last core of this machine, woken from the first. Raises `Failure` if the
-    processes cannot run at real-time priorities.
+    """Measure the switch on the last core of this machine, with wake-ups from the first core.
+
+    Raises:
+        Failure: If the processes cannot run at real-time priorities.
     """
     cores = sorted(os.sched_getaffinity(0))
     spawn = multiprocessing.get_context("spawn")
@@ -88,7 +93,7 @@ def measure_switch() -> Distribution:
             stack.callback(process.join)
             stack.callback(process.kill)
             processes.append(process)
-        # This process is kept off the measured core.
+        # Keep this process off the measured core.
         stack.enter_context(pinned(cores[0]))
         try:
             shared.start.wait(READY_S)
@@ -119,50 +124,50 @@ def _start(
 
 
 def _execute(semaphore: Semaphore, shared: _Shared) -> None:
-    """Wake up and wait again: an executor with nothing to do."""
+    """Run the executor, which wakes up, notes the time and waits again."""
     awake = shared.awake
-    for at in range(shared.wakes):
+    for number in range(shared.wakes):
         semaphore.acquire()
-        awake[2 * at] = monotonic_ns()
-        awake[2 * at + 1] = monotonic_ns()
+        awake[2 * number] = monotonic_ns()
+        awake[2 * number + 1] = monotonic_ns()
 
 
 def _plan(semaphore: Semaphore, shared: _Shared) -> None:
-    """Compute when there is work, until the executor has interrupted; keep the longest gap."""
+    """Run the planner, which computes until it is interrupted, and keep the longest gap."""
     gaps = shared.gaps
     awake = shared.awake
-    for at in range(shared.wakes):
+    for number in range(shared.wakes):
         semaphore.acquire()
-        begin = last = monotonic_ns()
-        longest = 0
-        over = 2 * at + 1
-        seen = 0
-        while not seen and last - begin < PATIENCE_NS:
-            # Read before the clock: wherever in this loop the executor interrupts, the next clock
-            # value shows it.
-            seen = awake[over]
-            now = monotonic_ns()
-            if now - last > longest:
-                longest = now - last
-                gaps[2 * at] = last
-                gaps[over] = now
-                now = monotonic_ns()
-            last = now
+        begin_ns = last_ns = monotonic_ns()
+        longest_ns = 0
+        end_index = 2 * number + 1
+        awake_ns = 0
+        while not awake_ns and last_ns - begin_ns < PATIENCE_NS:
+            # Read this before the clock. Wherever the executor interrupts this loop, the next value
+            # of the clock then shows the gap.
+            awake_ns = awake[end_index]
+            now_ns = monotonic_ns()
+            if now_ns - last_ns > longest_ns:
+                longest_ns = now_ns - last_ns
+                gaps[2 * number] = last_ns
+                gaps[end_index] = now_ns
+                now_ns = monotonic_ns()
+            last_ns = now_ns
 
 
 def switch_times_us(gaps: np.ndarray, awake: np.ndarray) -> Distribution:
-    """Return the time of a switch over the wake-ups that interrupted the planner, us.
+    """Return the time of a switch for the wake-ups that interrupted the planner, us.
 
     Args:
-        gaps: Begin and end of the planner's longest gap by wake-up, ns, shape (n, 2).
+        gaps: Begin and end of the planner's longest gap at each wake-up, ns, shape (n, 2).
         awake: Begin and end of the executor's time awake, ns, shape (n, 2).
 
     Raises:
         Failure: If no wake-up interrupted the planner.
     """
-    found = (gaps[:, 0] > 0) & (gaps[:, 0] <= awake[:, 0]) & (awake[:, 1] <= gaps[:, 1])
-    lasted = np.diff(gaps - awake, axis=1)[found, 0] * 1e-3
-    times = distribution(lasted / 2)
+    is_interrupted = (gaps[:, 0] > 0) & (gaps[:, 0] <= awake[:, 0]) & (awake[:, 1] <= gaps[:, 1])
+    both_us = np.diff(gaps - awake, axis=1)[is_interrupted, 0] * 1e-3
+    times = distribution(both_us / 2)
     if times is None:
         raise Failure("no wake-up interrupted the planner: the machine is too busy to measure")
     return times

@@ -1,5 +1,6 @@
-"""Whole tasks of the paper's systems in real time: each is one rack, but Brown's, which is two
-joined by a network.
+"""Whole tasks of the paper's systems in real time.
+
+Each system is one rack, except Brown's, which consists of two racks joined by a network.
 """
 
 from __future__ import annotations
@@ -33,22 +34,29 @@ TASKS_S = {
     "penn": 26.2,
     "rccl": 17.5,
 }
-"""The systems of one rack, with the simulated time of their tasks, s; NASREM and the state tables
-have experiments of their own."""
+"""Systems of one rack with the simulated times of their tasks, s.
+
+NASREM and the state tables have separate experiments.
+"""
 STATE_TABLES = "nist-state-table"
 UNDISTURBED = ("scene.motion=[]", "clock.mode=lockstep")
-"""Nothing in the cell moves but the arm; which rows fire then depends on no clock."""
+"""Settings with which only the arm moves in the cell.
+
+In lockstep, the rows that fire then depend on no clock.
+"""
 TABLES_S = 55.0
 BROWN = "brown"
 SERVO = "brown/servo"
 BROWN_S = 8.3
 PATIENCE = 2.0
-"""Multiple of its time after which a task is ended, because a machine that is too slow may never
-finish it."""
+"""Multiple of its time after which a task is ended.
+
+A machine that is too slow may never finish it.
+"""
 ATTEMPTS = 3
 LAUNCH_S = 3.0
 LATER_MS = 100
-"""Additional delay of messages from the machine above in the second run."""
+"""Additional delay of messages from the machine above in the second run, ms."""
 DELAYED = ("lan.reference", "lan.modifications")
 MODIFICATION = "pd"
 """The first modification of the task."""
@@ -56,12 +64,12 @@ MODIFICATION = "pd"
 
 @dataclass(frozen=True)
 class WayResponse:
-    """The response one way, ms of simulated time.
+    """Response in one direction, ms of simulated time.
 
     Attributes:
-        longest_ms: The longest that was measured; None if nothing went all the way.
-        bound_ms: The longest on the grid.
-        unexplained: Responses beyond the bound that no missed cycle delayed.
+        longest_ms: Longest measured response. None if no message went all the way.
+        bound_ms: Longest response on the grid.
+        unexplained: Number of responses beyond the bound that no missed cycle delayed.
     """
 
     longest_ms: float | None
@@ -71,28 +79,29 @@ class WayResponse:
 
 @dataclass(frozen=True)
 class SystemResponse:
-    """The response of a rack by way, "command" and "status", next to equation 3.3, ms."""
+    """Response of a rack by direction, "command" and "status", and the sum of equation 3.3, ms."""
 
     sum_eq_3_3_ms: float
     ways: dict[str, WayResponse]
 
 
-def response_from(found: Mapping[str, Any] | None) -> SystemResponse | None:
-    """Return the response in a report; None without a hierarchy, or if it crosses racks, for which
-    there is no bound.
+def response_from(report: Mapping[str, Any] | None) -> SystemResponse | None:
+    """Return the response in a report.
+
+    None without a hierarchy, or if the hierarchy crosses racks and therefore has no bound.
     """
-    if found is None or found["crosses_racks"]:
+    if report is None or report["crosses_racks"]:
         return None
-    ways = {way: _way_response(found[way]) for way in ("command", "status")}
-    return SystemResponse(found["sum_eq_3_3_ms"], ways)
+    ways = {way: _way_response(report[way]) for way in ("command", "status")}
+    return SystemResponse(report["sum_eq_3_3_ms"], ways)
 
 
-def _way_response(way: Mapping[str, Any]) -> WayResponse:
-    delays = [beyond["delayed_by"] for beyond in way["beyond"]]
-    times = way["measured_ms"]
+def _way_response(direction: Mapping[str, Any]) -> WayResponse:
+    delays = [beyond["delayed_by"] for beyond in direction["beyond"]]
+    times = direction["measured_ms"]
     return WayResponse(
         longest_ms=None if times is None else times["max"],
-        bound_ms=way["bound_ms"],
+        bound_ms=direction["bound_ms"],
         unexplained=sum(not any("missed" in delay for delay in each) for each in delays),
     )
 
@@ -102,11 +111,11 @@ class TaskRun:
     """A run of a system's whole task.
 
     Attributes:
-        ended: Cause of its end.
-        lasted_s: Simulated time.
-        missed: Share of all cycles missed or skipped.
+        ended: Reason for its end.
+        lasted_s: Simulated time, s.
+        missed: Fraction of all cycles that were missed or skipped.
         messages: Number of messages by mailbox.
-        response: The response of the system. None if it has no bounded response.
+        response: Response of the system. None if it has no bounded response.
     """
 
     ended: str
@@ -118,12 +127,12 @@ class TaskRun:
 
 @dataclass(frozen=True)
 class NetworkRun(TaskRun):
-    """A run of a task on two racks, ended by the machine above, which fails if the servo rack does.
+    """A run of a task on two racks. The machine above ends it, and fails if the servo rack fails.
 
     Attributes:
-        servo_missed: Share of the servo rack's cycles missed or skipped.
-        response_ms: Time from the request of a modification by the machine above until a servo law
-            is modified. None if it never was.
+        servo_missed: Fraction of the servo rack's cycles that were missed or skipped.
+        response_ms: Time from the request for a modification by the machine above until a servo law
+            is modified, ms. None if it never was.
     """
 
     servo_missed: float
@@ -136,13 +145,13 @@ def _measure(name: str, workshop: Workshop) -> TaskRun:
 
 
 def task_run(result: RunResult, *recordings: Recording) -> TaskRun:
-    """Return what a whole task has left, in the recordings of its racks."""
-    boxes = {box: one.signal(box, "serial") for one in recordings for box in one.mailboxes}
+    """Summarise a run of a whole task from the recordings of its racks."""
+    boxes = {box: each.signal(box, "serial") for each in recordings for box in each.mailboxes}
     messages = {box: len(np.unique(serials)) for box, serials in boxes.items()}
     first = recordings[0]
     for status, entry, source in entries_of(first.layout, first.config):
         if source not in messages and status in first.mailboxes:
-            # Messages of a host board are counted where they enter the rack.
+            # Count the messages of a host board where they enter the rack.
             messages[source] = int(first.signal(status, f"{entry}.passed")[-1])
     return TaskRun(
         ended=result.outcome.cause,
@@ -162,8 +171,11 @@ class TableRun(TaskRun):
 
 @dataclass(frozen=True)
 class TableRuns:
-    """NIST's controller before NASREM, of executors with state tables: with what moves in the cell,
-    in real time, and without.
+    """Runs of NIST's controller before NASREM, whose executors follow state tables.
+
+    Attributes:
+        disturbed: Run in real time with moving objects in the cell.
+        undisturbed: Run in which only the arm moves.
     """
 
     disturbed: TableRun
@@ -192,89 +204,96 @@ TABLES = Experiment(
 
 
 def _missed(*recordings: Recording) -> float:
-    return count_cycles(task for one in recordings for task in one.ended["tasks"].values()).share
+    return count_cycles(task for each in recordings for task in each.ended["tasks"].values()).share
 
 
 def _measure_two(later_ms: int, workshop: Workshop) -> NetworkRun:
     """Run Brown's racks with a network that is slower by `later_ms`.
 
-    Two recorders share two cores with eight boards, so a run may lose records. It is then repeated,
-    up to `ATTEMPTS` runs in all.
+    Two recorders share two cores with eight boards and may lose records. The run is then repeated,
+    up to `MAX_ATTEMPTS` runs in total.
     """
     lost: list[str] = []
     for attempt in range(1, ATTEMPTS + 1):
         result, general, servo = _two_recorded(later_ms, workshop, attempt)
-        lost = [one.layout.rack for one in (general, servo) if one.lost]
+        lost = [each.layout.rack for each in (general, servo) if each.lost]
         if not lost:
             return NetworkRun(
                 **vars(task_run(result, general, servo)),
                 servo_missed=_missed(servo),
                 response_ms=_response_ms(general, servo),
             )
-    raise Failure(f"not all of {' and '.join(lost)} is recorded, in {ATTEMPTS} runs")
+    raise Failure(f"{' and '.join(lost)} lost records in each of {ATTEMPTS} runs")
 
 
 def _two_recorded(
     later_ms: int, workshop: Workshop, attempt: int
 ) -> tuple[RunResult, Recording, Recording]:
+    """Run both of Brown's racks, and return the result and both recordings."""
     label = f"task-{BROWN}-{later_ms}-{attempt}"
     path = workshop.folder / f"{label}-servo.toml"
     path.write_text(_servo(workshop, later_ms).text(), encoding="utf-8")
-    ways = f'adapter.lan.connect=["{_socket(workshop)}"]', f'adapter.lan.launch=["{path}"]'
+    lan_settings = f'adapter.lan.connect=["{_socket(workshop)}"]', f'adapter.lan.launch=["{path}"]'
     with chdir(workshop.folder):
-        # The rack that it launches records its run below the working folder.
-        result, general = workshop.run(label, _renamed(workshop, BROWN, ways))
-    (other,) = result.others
-    assert other.folder is not None, "it is recorded, as the other is"
+        # The rack that is launched by this one records its run below the working folder.
+        result, general = workshop.run(label, _renamed(workshop, BROWN, lan_settings))
+    (launched,) = result.others
+    assert launched.folder is not None, "it is recorded, as the other is"
     folder = workshop.folder / RUNS / f"{label}-servo"
     shutil.rmtree(folder, ignore_errors=True)
-    return result, general, Recording((workshop.folder / other.folder).rename(folder))
+    return result, general, Recording((workshop.folder / launched.folder).rename(folder))
 
 
 def _servo(workshop: Workshop, later_ms: int) -> RackConfig:
+    """Build the config of the servo rack, with delayed messages if the network is slower."""
     peer = f"lan.peer_{workshop.rack.replace('-', '_')}"
-    more = [f'adapter.lan.listen=["{_socket(workshop)}"]', f'board.supervisor.reads.peer="{peer}"']
+    added = [f'adapter.lan.listen=["{_socket(workshop)}"]', f'board.supervisor.reads.peer="{peer}"']
     if later_ms:
-        given = load(SERVO)
-        assert given.adapter.lan is not None
-        by = round(1e-3 * later_ms * given.adapter.lan.rate_hz)
-        faults = [f'{{kind="delay", board="lan", mailbox="{box}", by={by}}}' for box in DELAYED]
-        delay = given.board["supervisor"].params["delay"] + 1e-3 * later_ms
-        more += [f"board.supervisor.params.delay={delay}", f"fault=[{', '.join(faults)}]"]
-    return _renamed(workshop, SERVO, more)
+        config = load(SERVO)
+        assert config.adapter.lan is not None
+        cycles = round(1e-3 * later_ms * config.adapter.lan.rate_hz)
+        faults = [f'{{kind="delay", board="lan", mailbox="{box}", by={cycles}}}' for box in DELAYED]
+        delay_s = config.board["supervisor"].params["delay"] + 1e-3 * later_ms
+        added += [f"board.supervisor.params.delay={delay_s}", f"fault=[{', '.join(faults)}]"]
+    return _renamed(workshop, SERVO, added)
 
 
 def _socket(workshop: Workshop) -> str:
     return f"unix/{workshop.rack}-servo"
 
 
-def _renamed(workshop: Workshop, name: str, more: Sequence[str]) -> RackConfig:
-    """Return one of both racks under a unique name, which the other rack uses for its imports."""
-    given = load(name)
-    assert given.adapter.lan is not None
-    own = {BROWN: workshop.rack, f"{BROWN}-servo": f"{workshop.rack}-servo"}
+def _renamed(workshop: Workshop, name: str, added: Sequence[str]) -> RackConfig:
+    """Load one of both racks with added settings, under a unique name.
+
+    The other rack uses this name in its imports.
+    """
+    config = load(name)
+    assert config.adapter.lan is not None
+    names = {BROWN: workshop.rack, f"{BROWN}-servo": f"{workshop.rack}-servo"}
     imports = [
-        f'adapter.lan.import.{port}.from="{own[entry.rack]}/{entry.mailbox}"'
-        for port, entry in given.adapter.lan.imports.items()
+        f'adapter.lan.import.{port}.from="{names[entry.rack]}/{entry.mailbox}"'
+        for port, entry in config.adapter.lan.imports.items()
     ]
-    return load(workshop.source(name), [*imports, *more, *UNVIEWED, f"name={own[given.name]}"])
+    return load(workshop.source(name), [*imports, *added, *UNVIEWED, f"name={names[config.name]}"])
 
 
 def _response_ms(general: Recording, servo: Recording) -> float | None:
-    """Return the time from the first message that wants a modification to the status that says it
-    is in.
+    """Return the time from the first request for a modification until a status reports it.
+
+    None if either message is missing.
     """
-    wanted_ns = _first_ns(general, "modifications.command", "wanted")
-    is_in_ns = _first_ns(servo, "shoulder.status", "reason")
-    return None if wanted_ns is None or is_in_ns is None else 1e-6 * (is_in_ns - wanted_ns)
+    begin_ns = _first_ns(general, "modifications.command", "wanted")
+    end_ns = _first_ns(servo, "shoulder.status", "reason")
+    return None if begin_ns is None or end_ns is None else 1e-6 * (end_ns - begin_ns)
 
 
 def _first_ns(recording: Recording, box: str, field: str) -> int | None:
-    """Return when the first message that names the modification is visible: on CLOCK_MONOTONIC, in
-    lockstep in the simulated time of both.
+    """Return the time at which the first message that names the modification is visible, ns.
+
+    It is CLOCK_MONOTONIC time, or simulated time in lockstep.
     """
-    named = [MODIFICATION in str(text) for text in recording.signal(box, field)]
-    ticks = recording.signal(box, "visible_at")[named]
+    is_named = [MODIFICATION in str(text) for text in recording.signal(box, field)]
+    ticks = recording.signal(box, "visible_at")[is_named]
     if not len(ticks):
         return None
     grid = RackGrid(recording)
@@ -285,8 +304,8 @@ def _first_ns(recording: Recording, box: str, field: str) -> int | None:
 
 def _two_racks(later_ms: int, about: str) -> Experiment[NetworkRun]:
     name = f"task-{BROWN}-later" if later_ms else f"task-{BROWN}"
-    lasts_s = BROWN_S + 2 * LAUNCH_S
-    return Experiment(name, about, lasts_s, NetworkRun, partial(_measure_two, later_ms))
+    measure = partial(_measure_two, later_ms)
+    return Experiment(name, about, BROWN_S + 2 * LAUNCH_S, NetworkRun, measure)
 
 
 NETWORK = _two_racks(0, "the whole task of brown's two racks in real time")
