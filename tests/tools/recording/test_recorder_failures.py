@@ -84,7 +84,7 @@ def test_a_recorder_that_is_stopped_is_replaced_without_a_loss(
     assert display.struck
     assert (result.worked, result.recording) == (True, "complete")
     recording = Recording(tmp_path / "run")
-    assert notes_of(recording)[0] == "the recorder is not responding: killed"
+    assert notes_of(recording)[0] == "the recorder did not respond and was killed"
     rows = len(recording.signal("lower.status", "serial"))
     assert rows == result.outcome.ticks or mode == "realtime"
 
@@ -178,9 +178,9 @@ def test_a_recorder_that_dies_over_the_viewers_file_is_reported(
 @pytest.mark.slow
 def test_two_recorders_do_not_write_into_one_folder(config: RackConfig, tmp_path: Path) -> None:
     with Rack(config) as rack, Recorder(rack.segment, tmp_path):
-        with pytest.raises(Failure, match="another recorder is running there"):
+        with pytest.raises(Failure, match="another recorder is still writing it"):
             Recorder(rack.segment, tmp_path)
-        with pytest.raises(Failure, match="another recorder is running there"):
+        with pytest.raises(Failure, match="another recorder is still writing it"):
             mend(tmp_path)
 
 

@@ -92,9 +92,9 @@ UNKNOWN = {
     "xyz": "no such signal; mailboxes: walker.status",
     "walker.status.speed]": "no such signal; nearest: walker.status.speed",
     "walker.status.legs.angle[2]": (
-        "no such index; permitted: walker.status.legs.angle[0 to 1][0 to 1]"
+        "no such index; valid: walker.status.legs.angle[0 to 1][0 to 1]"
     ),
-    "walker.status.speed[0]": "no such index; permitted: walker.status.speed",
+    "walker.status.speed[0]": "no such index; valid: walker.status.speed",
 }
 
 
@@ -124,12 +124,12 @@ def test_a_condition_compares_a_number(messages: np.ndarray, text: str, holds: l
 
 UNFIT = {
     "walker.status.speed": (
-        '"{}": not a condition; permitted: as in "servo.status.position[2] > 1.2"'
+        '"{}" is not a condition; write one like "servo.status.position[2] > 1.2"'
     ),
     "walker.status.legs.angle[0] > 1": (
-        "walker.status.legs.angle[0]: numbers of shape [2]; a condition needs a single number"
+        "walker.status.legs.angle[0] is numbers of shape [2]; a condition needs a single number"
     ),
-    "walker.status.name == 1": "walker.status.name: text; a condition needs a single number",
+    "walker.status.name == 1": "walker.status.name is text; a condition needs a single number",
     "walker.status.speed > x": '"{}": x is not a number',
     "walker.status.gait == runs": '"{}": runs is not a number or one of stands, walks',
 }

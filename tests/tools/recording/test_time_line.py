@@ -60,7 +60,7 @@ def test_another_launch_of_a_rack_is_refused(tmp_path: Path) -> None:
     one = recorded(A, [B], tmp_path / "a")
     later = recorded(replace(B, begins_ns=B.begins_ns + 60 * S), [], tmp_path / "b")
     with pytest.raises(
-        Failure, match=r"not of the same run: .* 'b' that 'a' met began 60\.00\d s earlier"
+        Failure, match=r"not of the same run: 'a' met a launch of 'b' that began 60\.00\d s earlier"
     ) as refused:
         on_one_time_line([one, later])
     assert refused.value.status == 2
@@ -81,6 +81,6 @@ def test_in_lockstep_what_one_took_must_be_what_the_other_wrote(tmp_path: Path) 
     one, other = recorded(a, [b], tmp_path / "a"), recorded(b, [], tmp_path / "b", counts_from=1)
     with pytest.raises(
         Failure,
-        match=r"not of the same run: what 'a' took from 'b' at 0\.0000 s, in lan\.other, is",
+        match=r"message that 'a' imported into lan\.other at 0\.0000 s is not one that 'b' wrote",
     ):
         on_one_time_line([one, other])
