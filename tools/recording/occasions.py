@@ -81,7 +81,7 @@ class Occasions:
         }
 
     def alarms(self) -> Iterator[int]:
-        """Yield the ticks of alarms since the last call. The first call yields all available ones."""
+        """Yield the ticks of alarms since the last call, or of all remaining alarms at first."""
         for ring in self._alarms:
             rows = ring.drain().rows
             yield from rows["tick"][~np.isin(rows["code"], ORDINARY)].tolist()

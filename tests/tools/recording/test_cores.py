@@ -101,7 +101,7 @@ def test_misses_are_told_apart_by_core_and_time(small: Path, tmp_path: Path) -> 
     }
     assert (report["stalls"]["lost"], report["stalls"]["during_steal"]) == (3, 1)
     taken = f"core {core} for 0.20 %, core {core + 1} for 0.60 % of the run"
-    line = f"- the hypervisor took {taken} (steal); 1 of 3 lost cycles were due meanwhile"
+    line = f"- the hypervisor took {taken} (steal); 1 of 3 lost cycles were due at these times"
     assert line in markdown(report)
 
 

@@ -231,7 +231,7 @@ def test_the_command_prints_the_chain_and_refuses_what_cannot_be_compared(
     _, one, two = runs
     done = rack("report", two.folder, "--against", one.folder)
     assert done.returncode == 1
-    assert "  - not repeated: --repeat runs both racks again, to that cycle" in done.stdout
+    assert "  - not repeated: --repeat runs both racks again, up to that cycle" in done.stdout
     assert f"  - board.wave.params.factor is 2, in {one.folder} not set" in done.stdout.splitlines()
     other = ran("other", COMMANDED)
     against = (one.folder, "--against")

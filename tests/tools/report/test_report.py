@@ -186,7 +186,7 @@ def test_the_section_of_misses_says_where_it_holds_fewer_than_the_headline(folde
     assert "## Missed and skipped cycles: 1 and 3" in lines
     assert "The tasks counted" not in markdown(report)
     fewer = markdown({**report, "missed": 2, "skipped": 7})
-    assert "The tasks counted 2 and 7; the recording does not hold all of it." in fewer
+    assert "The tasks counted 2 and 7; the recording does not contain all of them." in fewer
     lossy = markdown({**report, "missed": 2, "skipped": 7, "rows_lost": {"lower": 4}})
     assert "The tasks counted 2 and 7; the recorder lost rows." in lossy
     assert "- the recorder lost rows: lower 4" in lossy.splitlines()
