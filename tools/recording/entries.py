@@ -109,10 +109,9 @@ def commands_from(recording: Recording, tick: int) -> tuple[Request, ...]:
     `Failure` if the recording lacks some.
     """
     end = next((end for _, end in recording.kept if tick < end), None)
-    requests_issued = _issued(recording)
     return tuple(
         request
-        for request in requests_issued
+        for request in _issued(recording)
         if tick <= request.tick and (end is None or request.tick < end)
     )
 
@@ -120,7 +119,7 @@ def commands_from(recording: Recording, tick: int) -> tuple[Request, ...]:
 def _issued(recording: Recording) -> list[Request]:
     """Load the commands that the clock issued, in order. Raises `Failure` if some are missing."""
     layout = recording.layout
-    numbered_requests: list[tuple[int, int, Request]] = []
+    numbered: list[tuple[int, int, Request]] = []
     for box in layout.mailboxes:
         if box.writer != CLOCK or box.name not in recording.mailboxes:
             continue
@@ -131,11 +130,11 @@ def _issued(recording: Recording) -> list[Request]:
         # Clear the id: the clock assigns it when it issues the command again.
         messages[COMMAND_ID] = 0
         for tick, number, message in zip(rows["tick"].tolist(), ids, messages, strict=True):
-            numbered_requests.append(
+            numbered.append(
                 (tick, number, Request(layout.index(box.name), message.tobytes(), tick))
             )
-    numbered_requests.sort(key=lambda command: command[:2])
-    return [request for _, _, request in numbered_requests]
+    numbered.sort(key=lambda command: command[:2])
+    return [request for _, _, request in numbered]
 
 
 def _type_of(box: MailboxSpec) -> str:

@@ -189,13 +189,11 @@ def on_one_time_line(recordings: Sequence[Recording]) -> list[RackPlace]:
         _check_company(grid, grids[:index])
     placed = {0: RackPlace(grids[0], grids[0])}
     while len(placed) < len(grids):
-        candidates = [
-            (near, far) for near in placed for far in range(len(grids)) if far not in placed
-        ]
         connections = (
             (near, far, offsets)
-            for near, far in candidates
-            if (offsets := _way(grids[far], grids[near])) is not None
+            for near in placed
+            for far in range(len(grids))
+            if far not in placed and (offsets := _way(grids[far], grids[near])) is not None
         )
         if (connection := next(connections, None)) is None:
             unplaced = next(grid for index, grid in enumerate(grids) if index not in placed)

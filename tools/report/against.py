@@ -32,7 +32,7 @@ def compared(recording: Recording, asked: OtherRun) -> Document:
     first_miss = min(
         (miss["tick"] for run in divergence.runs for miss in misses(run)), default=None
     )
-    first_difference = next(iter(divergence.unlike.values()), None)
+    first = next(iter(divergence.unlike.values()), None)
     chain = divergence.chain(asked.of)
     repetition = _repeated(divergence, chain[-1], asked.repeats) if chain else ""
     other_folder = str(asked.folder)
@@ -46,11 +46,9 @@ def compared(recording: Recording, asked: OtherRun) -> Document:
         lines.append(f"{asked.of} is equal in both")
     return {
         "folder": other_folder,
-        "first_difference": first_difference
-        and asdict(Difference(first_difference.tick, first_difference.mailbox)),
+        "first_difference": first and asdict(Difference(first.tick, first.mailbox)),
         "first_miss_tick": first_miss,
-        "explained": first_difference is None
-        or (first_miss is not None and first_miss <= first_difference.tick),
+        "explained": first is None or (first_miss is not None and first_miss <= first.tick),
         "chain": [asdict(cycle) for cycle in chain],
         "repetition": asdict(repetition) if isinstance(repetition, Repetition) else None,
         "not_repeated": why_not,
@@ -80,10 +78,9 @@ def _repeated(divergence: Divergence, last: UnlikeCycle, is_wanted: bool) -> Rep
         return str(failure)
 
 
-def _cycle_lines(cycle: UnlikeCycle, other_folder: str) -> Iterator[str]:
+def _cycle_lines(cycle: UnlikeCycle, other: str) -> Iterator[str]:
     """Yield sentences about a cycle: the difference, its inputs, and possible causes."""
-    fields = _several(_field(cycle, field, other_folder) for field in cycle.fields)
-    yield f"at tick {cycle.tick}: {fields}"
+    yield f"at tick {cycle.tick}: {_several(_field(cycle, field, other) for field in cycle.fields)}"
     if cycle.unequal:
         yield f"'{cycle.writer}' wrote it after reading {cycle.unequal}, which already differed"
     elif cycle.writer == CLOCK:
@@ -96,7 +93,7 @@ def _cycle_lines(cycle: UnlikeCycle, other_folder: str) -> Iterator[str]:
     settings = [clue.values for clue in cycle.clues if clue.values is not None]
     yield from (_clue(clue) for clue in cycle.clues if clue.values is None)
     if settings:
-        yield _several(_values(values, other_folder, "not set") for values in settings)
+        yield _several(_values(values, other, "not set") for values in settings)
     if not (cycle.clues or cycle.unequal):
         yield f"no fault, loss, miss or setting of '{cycle.writer}' differs"
 
@@ -145,14 +142,12 @@ def _clue(clue: Clue) -> str:
     return f"in {clue.run} only, at tick {clue.tick}: {clue.text}" if clue.run else clue.text
 
 
-def _repetition_lines(
-    repetition: Repetition, cycle: UnlikeCycle, other_folder: str
-) -> Iterator[str]:
+def _repetition_lines(repetition: Repetition, cycle: UnlikeCycle, other: str) -> Iterator[str]:
     """Yield sentences about the result of a repetition."""
     task = cycle.writer
     runs = " and ".join(repetition.runs)
     if repetition.attributes:
-        shown = _several(_values(attribute, other_folder) for attribute in repetition.attributes)
+        shown = _several(_values(attribute, other) for attribute in repetition.attributes)
         yield f"before that cycle the state of '{task}' differed: {shown}"
     else:
         yield f"before that cycle the state of '{task}' was equal, as far as it can be compared"
@@ -167,5 +162,4 @@ def _repetition_lines(
     else:
         yield f"'{task}' repeats both messages, so its code has not changed"
     for run, names in repetition.strays.items():
-        boxes = ", ".join(names)
-        yield f"uncertain: when repeated, {run} also differs from its recording in {boxes}"
+        yield f"uncertain: repeated, {run} also differs from its recording in {', '.join(names)}"

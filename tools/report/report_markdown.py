@@ -154,15 +154,14 @@ def _machine(report: RunReport) -> Iterator[str]:
     steal = report.steal
     stalls = report.stalls
     frequency = report.frequency_mhz or {}
-    lost_clause = f"of {stalls['lost']} lost cycles were due at these times"
+    lost = f"of {stalls['lost']} lost cycles were due at these times"
     if steal["ms"]:
         cores = ", ".join(f"core {core} for {steal['percent'][core]:.2f} %" for core in steal["ms"])
-        lost = stalls["during_steal"]
-        yield f"- the hypervisor took {cores} of the run (steal); {lost} {lost_clause}"
+        yield f"- the hypervisor took {cores} of the run (steal); {stalls['during_steal']} {lost}"
     for absence in stalls["absences"]:
         details = f"stalls: {absence['times']}, longest {absence['longest_ms']:.3g} ms"
         where = f"core {absence['core']} was away although no steal was counted"
-        yield f"- {where} ({details}); {absence['lost']} {lost_clause}"
+        yield f"- {where} ({details}); {absence['lost']} {lost}"
     if quota := stalls["quota"]:
         causes = [*(f"the cycle of {level}" for level in quota["levels"]), "a quota of the host"]
         yield (
@@ -289,8 +288,7 @@ def _response_along(response: Document) -> Blocks:
             why = "; ".join(slow["delayed_by"]) or "no cause is recorded"
             yield f"- {slow['ms']:g} ms from tick {slow['tick']}: {why}"
         if unseen := measured["unseen"]:
-            why = "messages are missing in the recording"
-            yield from ("", f"{direction}: {unseen} could not be measured, because {why}.")
+            yield from ("", f"{direction}: {unseen} not measured, because messages are missing.")
 
 
 def _queues(queues: Sequence[Document]) -> Iterator[str]:
