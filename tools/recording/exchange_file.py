@@ -43,13 +43,13 @@ class ChannelMessage(NamedTuple):
     data: bytes
 
 
-def export(recording: Recording, path: Path, show: Callable[[float], None]) -> int:
+def export(recording: Recording, path: Path, show_progress: Callable[[float], None]) -> int:
     """Write a recording as an MCAP file.
 
     Args:
         recording: The recording.
         path: File to write.
-        show: Called with the completed fraction, 0 to 1.
+        show_progress: Called with the completed fraction, 0 to 1.
 
     Returns:
         Number of messages in the file.
@@ -73,7 +73,7 @@ def export(recording: Recording, path: Path, show: Callable[[float], None]) -> i
             )
             count += 1
             if count % BLOCK == 0:
-                show(count / total)
+                show_progress(count / total)
         writer.finish()  # type: ignore[no-untyped-call]
     return count
 

@@ -126,7 +126,7 @@ class RackPlace:
     Attributes:
         own: Grid of the rack.
         line: Grid of the rack that gives the time line.
-        shifts: Clock offsets that lead from the rack to the line's. Empty if both share their
+        offsets: Clock offsets that lead from the rack to the line's. Empty if both share their
             ticks, as in lockstep, or for the first rack itself.
         by_ticks: True if two runs of the same rack are aligned tick by tick.
         marks: Notes for the user. Empty for the first rack.
@@ -173,7 +173,7 @@ class RackPlace:
         return self.line.time_ns(self.stamps_ns(self.own.stamp_ns(ticks, within_ns)))
 
     def wall_ns(self, stamps_ns: Ints) -> Ints:
-        """Convert time stamps to the line's wall clock, or to its own if it has no shifts."""
+        """Convert time stamps to the line's wall clock, or to its own if it has no offsets."""
         launch = self.line.launch if self.shifts else self.own.launch
         return self.stamps_ns(stamps_ns) + launch.wall_offset_ns
 

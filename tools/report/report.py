@@ -50,8 +50,8 @@ class OtherRun:
 
     Attributes:
         folder: Folder of the other run.
-        of: Mailbox whose first difference is explained, or "" for the earliest difference.
-        repeats: Whether both runs may be repeated to find the cause.
+        mailbox: Mailbox whose first difference is explained, or "" for the earliest difference.
+        may_repeat: Whether both runs may be repeated to find the cause.
     """
 
     folder: Path

@@ -43,7 +43,8 @@ class ContactPlace(NamedTuple):
     Attributes:
         name: Name of the place.
         site: Site at which it is.
-        turned: Site whose orientation the sensed vectors have, or None if they have the world's.
+        orientation_site: Site whose orientation the sensed vectors have, or None if they have the
+            world's.
     """
 
     name: str

@@ -55,19 +55,19 @@ def _finger_curves(
         colours,
     )
 
-    def tensions(block: RowBlock) -> np.ndarray:
-        found = [
+    def stack_tensions(block: RowBlock) -> np.ndarray:
+        columns = [
             block.messages[field][:, row][:, joints]
             for field in ("wanted", "tension")
             for row in (FLEXOR, EXTENSOR)
         ]
-        return np.hstack(found)
+        return np.hstack(columns)
 
     tendons = [f"{name} {row}" for row in ("flexor", "extensor") for name in joint_names]
     yield curves(
         stream,
         (HAND, finger, TENSIONS),
-        tensions,
+        stack_tensions,
         [f"{tendon}{what}, N" for what in (" commanded", "") for tendon in tendons],
         [COMMANDED] * len(tendons) + colours + [dimmed(colour) for colour in colours],
         np.repeat(OVERLAID, len(tendons)).tolist(),

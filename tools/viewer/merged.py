@@ -14,7 +14,9 @@ from rack.tools.viewer.sink import RackWriter, Ran, block_of
 from rack.tools.viewer.stream import Moment, Stream, Timelines, new_recording
 
 
-def write_merged(placed: Sequence[RackPlace], file: Path, show: Callable[[float], None]) -> None:
+def write_merged(
+    placed: Sequence[RackPlace], file: Path, show_progress: Callable[[float], None]
+) -> None:
     """Write one recording that shows all of these racks, each under its name.
 
     The notes on the times of the racks go to its log. A single rack's recording equals its run.rrd.
@@ -22,7 +24,7 @@ def write_merged(placed: Sequence[RackPlace], file: Path, show: Callable[[float]
     Args:
         placed: The racks and their places on the time line.
         file: File to write.
-        show: Called with the completed fraction, 0 to 1.
+        show_progress: Called with the completed fraction, 0 to 1.
 
     Raises:
         Failure: A recording cannot be read.
@@ -64,7 +66,7 @@ def write_merged(placed: Sequence[RackPlace], file: Path, show: Callable[[float]
             lost = grid.recording.lost if tick == last else {}
             writer.write(rows, tick, lost)
             stream.flush()
-            show((index + tick / last) / len(placed))
+            show_progress((index + tick / last) / len(placed))
     recording.disconnect()
 
 

@@ -89,7 +89,10 @@ class SimulatedHand(Simulation):
 
     @property
     def wanted(self) -> Array:
-        """Commanded tensions of open valves, equilibrium tensions of closed ones, (2, joints), N."""
+        """Commanded tensions of open valves, or equilibrium tensions of closed ones.
+
+        Its shape is (2, joints), its unit N.
+        """
         return np.asarray(np.clip(self._data.ctrl[self.hand.actuators], 0.0, self.hand.most))
 
     def sense(self) -> HandSample:
