@@ -69,7 +69,7 @@ def bounded() -> Iterator[None]:
         signal.signal(signal.SIGALRM, before)
 
 
-def values(folder: Path) -> object:
+def read_values(folder: Path) -> object:
     """Return everything that a recording says."""
     found = Recording(folder)
     signals = {
@@ -81,10 +81,10 @@ def values(folder: Path) -> object:
     return repr((found.config, cycles, signals, found.events, found.lost, found.kept, found.layout))
 
 
-def failure_of(folder: Path) -> str:
+def find_failure(folder: Path) -> str:
     """Return why a run is refused, empty if it is not."""
     try:
-        values(folder)
+        read_values(folder)
     except Failure as failure:
         return str(failure)
     return ""
@@ -107,18 +107,18 @@ def flipped_bits(folder: Path, pattern: str, flips: int) -> Iterator[tuple[Path,
     "pattern", [SIGNALS, "cycles.parquet", "events.jsonl", CONFIG, CHECKSUMS, "report.*"]
 )
 def test_a_flipped_bit_is_named_or_changes_no_value(damaged: Path, pattern: str) -> None:
-    whole = values(damaged)
+    whole = read_values(damaged)
     report = rack("report", damaged, "--json").stdout
     for path, content in flipped_bits(damaged, pattern, FLIPS):
         before = path.read_bytes()
         path.write_bytes(content)
-        why = failure_of(damaged)
+        why = find_failure(damaged)
         if why:
             # A damaged checksum is taken for a damaged file; the line names both.
             assert str(path.relative_to(damaged)) in why
             assert len(why.splitlines()) == 1
         else:
-            assert values(damaged) == whole
+            assert read_values(damaged) == whole
             assert pattern in (CHECKSUMS, "report.*")
             assert rack("report", damaged, "--json").stdout == report
         path.write_bytes(before)
@@ -130,7 +130,7 @@ def test_a_flipped_bit_is_named_or_changes_no_value(damaged: Path, pattern: str)
     [("", SPOOL, r"recorder\.spool: "), ('record={ keep = "60 s" }', "stretches/*", "stretches/")],
     ids=["killed", "flight"],
 )
-def test_a_flipped_bit_in_what_a_recorder_leaves_is_named(
+def test_a_flipped_bit_in_the_files_of_a_killed_recorder_is_named(
     small: Path, rack_name: str, tmp_path: Path, record: str, pattern: str, why: str
 ) -> None:
     config = load(small, [f"name={rack_name}", *([record] if record else [])])
@@ -150,10 +150,10 @@ def test_a_flipped_bit_in_what_a_recorder_leaves_is_named(
         with pytest.raises(Failure, match=why):
             Recording(again)
         shutil.rmtree(again)
-    assert values(copy)
+    assert read_values(copy)
 
 
-def test_a_value_that_is_not_a_number_is_null_in_json_and_comes_back() -> None:
+def test_nan_is_null_in_json_and_is_restored() -> None:
     line = checked_line({"kind": "detection", "value": float("nan")})
     assert json.loads(line, parse_constant=pytest.fail)["value"] is None
     assert np.isnan(read_line(line)["value"])
@@ -230,7 +230,7 @@ def test_every_command_on_a_run_refuses_a_fifo_or_a_device_for_a_file(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["report.json", "report.md"])
-def test_a_report_replaces_its_own_files_whatever_they_are(damaged: Path, name: str) -> None:
+def test_a_report_replaces_its_files_whatever_their_type(damaged: Path, name: str) -> None:
     whole = rack("report", damaged).stdout
     for take_place in PLACES:
         (damaged / name).unlink()

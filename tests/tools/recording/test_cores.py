@@ -43,7 +43,7 @@ def steal(machine: Path, first: int, second: int) -> None:
     (machine / "stat").write_text(text)
 
 
-def test_a_rise_is_found_with_its_core_and_the_looks_around_it(machine: Path) -> None:
+def test_a_rise_of_steal_is_recorded_with_its_core_and_time_span(machine: Path) -> None:
     found = CoreMeter()
     found.look()
     assert found.record().stolen == ()
@@ -58,7 +58,7 @@ def test_a_rise_is_found_with_its_core_and_the_looks_around_it(machine: Path) ->
     assert CoreRecord.of(record.text()) == record
 
 
-def test_frequencies_are_those_of_cpuinfo_without_cpufreq(machine: Path) -> None:
+def test_frequencies_come_from_cpuinfo_without_cpufreq(machine: Path) -> None:
     found = CoreMeter()
     for mhz in ("2600.000", "1200.5"):
         (machine / "cpuinfo").write_text(
@@ -86,7 +86,7 @@ def run(folder: Path, config: Path, record: CoreRecord) -> Recording:
     return found
 
 
-def test_misses_are_told_apart_by_core_and_time(small: Path, tmp_path: Path) -> None:
+def test_misses_during_steal_are_counted_by_core_and_time(small: Path, tmp_path: Path) -> None:
     empty = run(tmp_path / "run", small, UNMEASURED)
     period_ns, core = empty.layout.clock_ns, empty.layout.task("lower").core
     during = Stolen(20 * period_ns - MS, 20 * period_ns + MS, core, 10)

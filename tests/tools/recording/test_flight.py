@@ -47,7 +47,7 @@ LEEWAY = 4
 """Stretches that are not whole seconds, and those at the borders."""
 
 
-class Measuring(Display):
+class StretchCounter(Display):
     """Counts the stretches in a folder, second by second."""
 
     period_s = 0.05
@@ -69,17 +69,17 @@ def config(small: Path, rack_name: str) -> RackConfig:
 
 
 @pytest.fixture(scope="module")
-def long_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunResult, Measuring]:
+def long_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunResult, StretchCounter]:
     """A run of a minute: its result, and how many stretches there were meanwhile."""
     folder = tmp_path_factory.mktemp("flight")
     (folder / "small.toml").write_text(SMALL)
     config = load(folder / "small.toml", [f"name=test-flight-{os.getpid()}", RECORD, FAULT])
-    display = Measuring(folder / "run")
+    display = StretchCounter(folder / "run")
     return run_rack(config, LONG_S, folder / "run", display), display
 
 
-def test_a_long_run_does_not_grow_and_what_surrounds_a_fault_stays(
-    long_run: tuple[RunResult, Measuring],
+def test_a_long_run_does_not_grow_and_keeps_the_time_around_a_fault(
+    long_run: tuple[RunResult, StretchCounter],
 ) -> None:
     result, display = long_run
     folder = display.folder
@@ -103,8 +103,8 @@ def test_a_long_run_does_not_grow_and_what_surrounds_a_fault_stays(
     assert recording.gaps() == []
 
 
-def test_what_is_removed_is_neither_lost_nor_a_gap_and_all_say_so(
-    long_run: tuple[RunResult, Measuring], tmp_path: Path
+def test_removed_stretches_count_neither_as_lost_nor_as_gaps(
+    long_run: tuple[RunResult, StretchCounter], tmp_path: Path
 ) -> None:
     folder, made = long_run[1].folder, tmp_path / "made.rrd"
     report, text = write_report(folder)
@@ -131,7 +131,7 @@ def test_what_is_removed_is_neither_lost_nor_a_gap_and_all_say_so(
     assert recording.kept_text in str([chunk.to_record_batch().to_pydict() for chunk in logged])
 
 
-def test_a_recorder_that_is_killed_goes_on_with_the_next_stretch(
+def test_a_restarted_flight_recorder_continues_with_the_next_stretch(
     config: RackConfig, tmp_path: Path
 ) -> None:
     display = Held(config.name, signal.SIGKILL, tick=25 * SECOND)
@@ -145,7 +145,7 @@ def test_a_recorder_that_is_killed_goes_on_with_the_next_stretch(
     assert not any(recording.lost.values())
 
 
-def fly(rack: Rack, folder: Path, seconds: float) -> Recorder:
+def record_flight(rack: Rack, folder: Path, seconds: float) -> Recorder:
     """Run a rack, and record it in this process; return the recorder, to be closed."""
     folder.mkdir()
     (folder / CONFIG).write_text(rack.config.text())
@@ -157,7 +157,7 @@ def fly(rack: Rack, folder: Path, seconds: float) -> Recorder:
     return recorder
 
 
-def what_lacks(segment: Segment, folder: Path) -> tuple[set[str], list[tuple[int, int]]]:
+def find_missing_rows(segment: Segment, folder: Path) -> tuple[set[str], list[tuple[int, int]]]:
     """Return the rings of which rows lack, and the ticks that had to be kept and are not there."""
     left, keeping = tally(folder), Retention.of(segment)
     assert left is not None
@@ -166,7 +166,7 @@ def what_lacks(segment: Segment, folder: Path) -> tuple[set[str], list[tuple[int
     return {*find_missing(segment, left.taken, left.lost)}, [tuple(ends) for ends in absent]
 
 
-def test_a_recording_is_complete_only_if_all_that_had_to_be_kept_is_there(
+def test_a_recording_is_complete_only_if_every_required_tick_is_kept(
     config: RackConfig, tmp_path: Path
 ) -> None:
     early = config.model_copy(
@@ -178,33 +178,33 @@ def test_a_recording_is_complete_only_if_all_that_had_to_be_kept_is_there(
         nothing = tmp_path / "nothing"
         nothing.mkdir()
         Recorder(segment, nothing).close()
-        fly(rack, folder, seconds=10.0).close()
-        assert what_lacks(segment, folder) == (set(), [])
+        record_flight(rack, folder, seconds=10.0).close()
+        assert find_missing_rows(segment, folder) == (set(), [])
         stretches = sorted((folder / STRETCHES).iterdir())
         # The last two may hold no rows: they begin when the run ends.
         around, last = stretches[1], stretches[-3]
         for path in (around, last):
             whole = path.read_bytes()
             path.unlink()
-            lacking, absent = what_lacks(segment, folder)
+            lacking, absent = find_missing_rows(segment, folder)
             # A file that is gone is not damage of another: it counts as removed, which it must not.
             assert not lacking
             assert absent
             path.write_bytes(whole)
         whole = last.read_bytes()
         last.write_bytes(whole[: len(whole) * 2 // 3])
-        lacking, absent = what_lacks(segment, folder)
+        lacking, absent = find_missing_rows(segment, folder)
         assert lacking
         assert not absent
-        lacking, absent = what_lacks(segment, nothing)
+        lacking, absent = find_missing_rows(segment, nothing)
     assert {"lower", "lower.status", "upper"} <= lacking
     assert absent
 
 
-def test_what_is_kept_is_saved_while_the_run_goes_on(config: RackConfig, tmp_path: Path) -> None:
+def test_kept_stretches_can_be_saved_during_the_run(config: RackConfig, tmp_path: Path) -> None:
     run, saved = tmp_path / "run", tmp_path / "saved"
     with Rack(config) as rack:
-        recorder = fly(rack, run, seconds=6.0)
+        recorder = record_flight(rack, run, seconds=6.0)
         left = sorted(path.name for path in (run / STRETCHES).iterdir())
         save_run(run, saved)
         recorder.close()

@@ -42,12 +42,14 @@ LATEST_S = 2.5
 BOUND_S = 60.0
 
 
-def family(pid: int) -> list[int]:
+def list_process_family(pid: int) -> list[int]:
     """Return a process and all its descendants."""
-    return [pid, *(one for child in children_of(pid) for one in family(child))]
+    return [pid, *(one for child in children_of(pid) for one in list_process_family(child))]
 
 
-def lost_by_a_kill(folder: Path, name: str, victim: str, seed: int, record: str = "") -> int:
+def count_ticks_lost_by_a_kill(
+    folder: Path, name: str, victim: str, seed: int, record: str = ""
+) -> int:
     """Run the small rack in real time, kill at a random instant; return the rows of its fastest
     task that were written by then and are not in the files, all of which are opened.
 
@@ -70,7 +72,11 @@ def lost_by_a_kill(folder: Path, name: str, victim: str, seed: int, record: str 
         # Where the recorder has begun late, the run may be over before that.
         at = min(at, RUN_S * TICKS_A_SECOND - 1)
         wait_until(lambda: segment.words[System.TICK] >= at, BOUND_S)
-        struck = {"recorder": [recorder], "launcher": [process.pid], "all": family(process.pid)}
+        struck = {
+            "recorder": [recorder],
+            "launcher": [process.pid],
+            "all": list_process_family(process.pid),
+        }
         tick = segment.words[System.TICK]
         for pid in struck[victim]:
             with suppress(ProcessLookupError):
@@ -108,4 +114,7 @@ def lost_by_a_kill(folder: Path, name: str, victim: str, seed: int, record: str 
 def test_a_kill_costs_at_most_a_second_and_every_table_opens(
     tmp_path: Path, rack_name: str, victim: str, record: str
 ) -> None:
-    assert lost_by_a_kill(tmp_path, rack_name, victim, seed=2, record=record) <= TICKS_A_SECOND
+    assert (
+        count_ticks_lost_by_a_kill(tmp_path, rack_name, victim, seed=2, record=record)
+        <= TICKS_A_SECOND
+    )

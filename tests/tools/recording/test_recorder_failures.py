@@ -49,7 +49,7 @@ def config(small: Path, rack_name: str) -> RackConfig:
 
 
 @pytest.mark.slow
-def test_a_recorder_that_is_killed_is_restarted_and_goes_on_where_it_was(
+def test_a_killed_recorder_is_restarted_and_continues_where_it_stopped(
     config: RackConfig, tmp_path: Path
 ) -> None:
     display = Held(config.name, signal.SIGKILL)
@@ -72,7 +72,7 @@ def test_a_recorder_that_is_killed_is_restarted_and_goes_on_where_it_was(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", ["lockstep", "realtime"])
-def test_a_recorder_that_is_stopped_is_replaced_without_a_loss(
+def test_a_stopped_recorder_is_replaced_without_losing_rows(
     config: RackConfig, tmp_path: Path, mode: str
 ) -> None:
     display: AtTick = Held(config.name, signal.SIGSTOP)
@@ -91,7 +91,7 @@ def test_a_recorder_that_is_stopped_is_replaced_without_a_loss(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", ["lockstep", "realtime"])
-def test_lockstep_waits_for_a_recorder_that_comes_late_and_real_time_does_not(
+def test_lockstep_waits_for_a_late_recorder_and_real_time_does_not(
     config: RackConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: str
 ) -> None:
     monkeypatch.setattr(recorder_process, "ATTACH_S", 0.0)
@@ -114,7 +114,7 @@ def test_lockstep_waits_for_a_recorder_that_comes_late_and_real_time_does_not(
     ],
     ids=["drop", "masquerade", "babble"],
 )
-def test_no_message_is_missing_or_taken_twice_though_some_are_faulty_and_a_recorder_is_killed(
+def test_no_message_is_missing_or_repeated_despite_damage_and_a_killed_recorder(
     small: Path, rack_name: str, fault: str, board: str
 ) -> None:
     faults = f"fault=[{{ {fault}, board = '{board}' }}]"
@@ -129,7 +129,7 @@ def test_no_message_is_missing_or_taken_twice_though_some_are_faulty_and_a_recor
 
 
 @pytest.mark.slow
-def test_a_run_whose_recorder_is_killed_too_often_has_not_worked_and_says_what_is_missing(
+def test_a_run_whose_recorder_dies_too_often_fails_and_reports_missing_rows(
     config: RackConfig, tmp_path: Path
 ) -> None:
     display = Held(config.name, signal.SIGKILL, times=recorder_process.RESTARTS + 1)
@@ -161,7 +161,7 @@ def test_a_run_whose_recorder_is_killed_too_often_has_not_worked_and_says_what_i
 
 
 @pytest.mark.slow
-def test_a_recorder_that_dies_over_the_viewers_file_is_reported(
+def test_a_recorder_that_dies_while_writing_the_viewers_file_is_reported(
     config: RackConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
@@ -185,7 +185,7 @@ def test_two_recorders_do_not_write_into_one_folder(config: RackConfig, tmp_path
 
 
 @pytest.mark.slow
-def test_a_run_is_opened_once_the_recorder_of_a_launcher_that_was_killed_has_finished(
+def test_opening_a_run_waits_for_the_recorder_of_a_killed_launcher(
     config: RackConfig, tmp_path: Path
 ) -> None:
     (tmp_path / CONFIG).write_text(config.text())
@@ -201,9 +201,7 @@ def test_a_run_is_opened_once_the_recorder_of_a_launcher_that_was_killed_has_fin
     assert not (tmp_path / SPOOL).exists()
 
 
-def test_a_spool_that_is_cut_anywhere_gives_what_is_whole(
-    config: RackConfig, tmp_path: Path
-) -> None:
+def test_a_truncated_spool_yields_all_complete_lines(config: RackConfig, tmp_path: Path) -> None:
     with Rack(config) as rack, Recorder(rack.segment, tmp_path) as recorder:
         rack.run(0.5)
         recorder.drain()
@@ -220,7 +218,7 @@ def test_a_spool_that_is_cut_anywhere_gives_what_is_whole(
     assert found[0] > 200 > found[-1]
 
 
-def test_a_spool_is_locked_until_the_files_made_of_it_are_in_place(
+def test_a_spool_is_locked_until_the_files_built_from_it_are_in_place(
     config: RackConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Otherwise two programs that open the run of a killed recorder at once damage it."""
@@ -237,7 +235,7 @@ def test_a_spool_is_locked_until_the_files_made_of_it_are_in_place(
     assert refused == [True]
 
 
-def test_a_gap_stays_where_it_was_after_the_recorder_is_gone(
+def test_a_gap_keeps_its_position_when_files_are_rebuilt(
     config: RackConfig, tmp_path: Path
 ) -> None:
     (tmp_path / CONFIG).write_text(config.text())

@@ -99,7 +99,7 @@ UNKNOWN = {
 
 
 @pytest.mark.parametrize(("name", "why"), UNKNOWN.items())
-def test_a_name_that_is_not_known_is_one_line(name: str, why: str) -> None:
+def test_an_unknown_name_is_reported_in_one_line(name: str, why: str) -> None:
     with pytest.raises(Failure) as failure:
         Signal.of(name, [BOX])
     assert str(failure.value).startswith(f"{name}: {why}")
@@ -136,7 +136,7 @@ UNFIT = {
 
 
 @pytest.mark.parametrize(("text", "why"), UNFIT.items())
-def test_a_condition_that_is_none_is_one_line(text: str, why: str) -> None:
+def test_an_invalid_condition_is_reported_in_one_line(text: str, why: str) -> None:
     with pytest.raises(Failure) as failure:
         Trigger.of(text, [BOX])
     assert (str(failure.value), failure.value.status) == (why.format(text), 2)

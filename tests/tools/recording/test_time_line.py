@@ -45,7 +45,7 @@ def test_a_rack_is_on_the_line_of_another_within_the_stated_uncertainty(
     )
 
 
-def test_racks_that_never_met_are_placed_by_one_that_met_both(tmp_path: Path) -> None:
+def test_racks_that_never_met_are_placed_through_a_common_peer(tmp_path: Path) -> None:
     a, b = recorded(A, [], tmp_path / "a"), recorded(B, [A, C], tmp_path / "b")
     c = recorded(C, [], tmp_path / "c")
     places = on_one_time_line([c, a, b])
@@ -76,7 +76,7 @@ def test_one_rack_twice_and_two_modes_are_refused(tmp_path: Path) -> None:
         on_one_time_line([one, stepped])
 
 
-def test_in_lockstep_what_one_took_must_be_what_the_other_wrote(tmp_path: Path) -> None:
+def test_in_lockstep_imported_messages_must_equal_the_senders_messages(tmp_path: Path) -> None:
     a, b = replace(A, mode="lockstep"), replace(B, mode="lockstep")
     one, other = recorded(a, [b], tmp_path / "a"), recorded(b, [], tmp_path / "b", counts_from=1)
     with pytest.raises(

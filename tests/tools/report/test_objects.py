@@ -63,7 +63,7 @@ def test_a_task_of_transfers_states_the_last_place_of_each_object(rack_name: str
     assert found == {0: ("block1", moves[-1], 10.0), 2: ("peg", (0.5, -0.3, 0.5), 3.0)}
 
 
-def test_a_goal_of_what_is_not_in_the_scene_is_a_mistake() -> None:
+def test_a_goal_for_an_object_outside_the_scene_is_a_mistake() -> None:
     with pytest.raises(
         ConfigError,
         match=r"scene.goal\[0\].object = \"block9\": no such object; scene.objects: block1",
@@ -72,7 +72,7 @@ def test_a_goal_of_what_is_not_in_the_scene_is_a_mistake() -> None:
 
 
 @pytest.mark.slow
-def test_what_is_let_go_in_the_air_is_a_finding_with_its_fall(
+def test_an_object_released_in_the_air_is_reported_with_its_fall(
     rack_name: str, tmp_path: Path
 ) -> None:
     (tmp_path / "drop.py").write_text(DROP)

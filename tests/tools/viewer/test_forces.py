@@ -66,9 +66,7 @@ def test_an_arrow_is_the_force_on_the_tool_in_the_worlds_frame(tmp_path: Path, c
     )
 
 
-def test_curves_show_what_is_wanted_of_the_tool_and_what_it_exerts(
-    tmp_path: Path, cell: Cell
-) -> None:
+def test_curves_show_wanted_and_exerted_forces(tmp_path: Path, cell: Cell) -> None:
     wrench, wanted, selected = np.zeros((3, ROWS, 6))
     wrench[:, 2], wanted[:, 2], selected[:, 2] = 18.0, -20.0, 1
     written = Written(tmp_path)
@@ -78,7 +76,7 @@ def test_curves_show_what_is_wanted_of_the_tool_and_what_it_exerts(
     assert np.isnan(read(written.file, "/forces/task_frame/x").values[-1][0])
 
 
-def test_the_contact_is_shown_against_the_arms_limits(tmp_path: Path, cell: Cell) -> None:
+def test_contact_forces_are_shown_with_the_arms_limits(tmp_path: Path, cell: Cell) -> None:
     assert cell.wrist is not None
     written = Written(tmp_path)
     parts = contact_forces(written.stream, cell.wrist.most)

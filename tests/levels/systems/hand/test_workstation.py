@@ -98,7 +98,7 @@ def workstation(**params: Any) -> Workstation:
 
 
 @pytest.mark.slow
-def test_it_plans_once_and_anew_when_the_object_moves_before_it_is_held() -> None:
+def test_it_plans_once_and_again_if_the_object_moves_before_it_is_held() -> None:
     crate, host = Crate(), workstation()
     crate.connect(host)
     host.run(crate)  # type: ignore[arg-type]
