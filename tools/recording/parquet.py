@@ -28,7 +28,7 @@ from rack.tools.recording.cores import CoreRecord
 
 TRACE_FIELDS = (pa.field("task", pa.string()), *(pa.field(name, pa.int64()) for name in FIELDS))
 HEAD = ("serial", "tick", "visible_at", "basis", "stamp_ns", "chain")
-"""Columns of every mailbox's messages. In a table they follow `TIME`."""
+"""Columns of every mailbox's messages. In a table they follow `TIME_COLUMN`."""
 TIME = "time_s"
 """Column with the tick as simulated time, s."""
 TRACE_ROWS = 1 << 16

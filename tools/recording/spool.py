@@ -123,7 +123,7 @@ KINDS = {kind.__name__: kind for kind in (SpoolHead, StretchHead, Frame, Stretch
 class Spool:
     """The spool of a folder, open for writing.
 
-    To continue the spool of another recorder, call `resume` first. Raises `Failure` if another
+    To continue the spool of another recorder, call `read_rest` first. Raises `Failure` if another
     recorder has it open, or if it belongs to another launch or rack.
     """
 

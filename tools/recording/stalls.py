@@ -186,10 +186,11 @@ class _Cycles:
 
         Args:
             on_core: Mask of the cycles on that core.
-            is_shown: False if nothing is due at a known time, as in lockstep.
+            is_shown: False if no cycle has a known due time, as in lockstep. All spans are then
+                empty.
 
         Returns:
-            Begin and end of each span, ns of CLOCK_MONOTONIC. The span is empty in the usual case.
+            Begin and end of each span, ns of CLOCK_MONOTONIC.
         """
         rows = self.rows[on_core]
         starts = rows["start_ns"]

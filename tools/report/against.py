@@ -131,7 +131,7 @@ def _text(value: object, absent: str) -> str:
 
 
 def _several(texts: Iterator[str]) -> str:
-    """Join clauses, of which only the first `SHOWN` are kept."""
+    """Join clauses. Beyond `MAX_SHOWN` clauses, only the number of the others is given."""
     clauses = [*texts]
     more = [f"{len(clauses) - SHOWN} more"] if len(clauses) > SHOWN else []
     return "; ".join([*clauses[:SHOWN], *more])

@@ -62,8 +62,8 @@ class Pair:
 class Analysis:
     """Comparison of a run with the timing model.
 
-    A level that does not fit fails in most of its cycles, but a machine that stalls now and then
-    does not make it fail in most. Therefore the equations are judged at two percentiles.
+    The equations are judged at two percentiles, because a level that does not fit fails in most of
+    its cycles, while a machine that stalls now and then makes it fail in a few.
 
     Attributes:
         recording: The run.
@@ -73,7 +73,7 @@ class Analysis:
         predicted: Timing of the rack with the budgets of its config.
         measured: Timing of the rack with the measured budgets.
         pairs: Verdicts at `percentile`.
-        mostly: Verdicts at `MOSTLY`, or at `percentile` if that is lower.
+        mostly: Verdicts at `MOST_CYCLES_PERCENTILE`, or at `percentile` if that is lower.
     """
 
     recording: Recording

@@ -82,8 +82,8 @@ class RecorderProcess:
     """Starts and supervises the recorder of a rack that is about to run.
 
     The recorder imports its libraries while the rack is being launched. If it dies, it is restarted
-    up to RESTARTS times in the same folder; if it hangs, it is killed first. In lockstep the clock
-    waits for it. If its files cannot be written, `read_news` and `finish` raise `Failure`.
+    up to `MAX_RESTARTS` times in the same folder; if it hangs, it is killed first. In lockstep the
+    clock waits for it. If its files cannot be written, `read_news` and `finish` raise `Failure`.
 
     Attributes:
         folder: Folder of the run.
