@@ -260,7 +260,7 @@ class Tensions(CommandsAbove):
         self.rests_on = 0  # serial of the newest operator command on which the tensions depend
 
     def merge_commands(self, tensions: Mapping[str, Reading[TensionCommand]]) -> None:
-        """Set `tension` and `rests_on`. Only valid if `missing` returned no reason."""
+        """Set `tension` and `rests_on`. Only valid if `find_missing` returned no reason."""
         self.rests_on = 0
         for board in self.oldest:
             value = tensions[board].message

@@ -1,5 +1,7 @@
-"""Damage to the files of a run: no flipped bit is read as another value, and nothing but regular
-files is opened."""
+"""Damage to the files of a run: no flipped bit is read as another value.
+
+Only regular files are opened.
+"""
 
 from __future__ import annotations
 
@@ -55,7 +57,7 @@ def config(small: Path, rack_name: str) -> RackConfig:
 
 @contextmanager
 def bounded() -> Iterator[None]:
-    """Fail what hangs."""
+    """Fail if the test hangs."""
 
     def give_up(number: int, frame: object) -> None:
         raise TimeoutError(f"hangs for {BOUND_S} s")
@@ -82,7 +84,7 @@ def read_values(folder: Path) -> object:
 
 
 def find_failure(folder: Path) -> str:
-    """Return why a run is refused, empty if it is not."""
+    """Return why a run is refused, or "" if it is not."""
     try:
         read_values(folder)
     except Failure as failure:
@@ -91,8 +93,10 @@ def find_failure(folder: Path) -> str:
 
 
 def flipped_bits(folder: Path, pattern: str, flips: int) -> Iterator[tuple[Path, bytes]]:
-    """Yield files with the same file after one of its bits was flipped, the bit drawn from all
-    bits of all files."""
+    """Yield files, each after one of its bits was flipped.
+
+    The bits are drawn from all bits of all matching files.
+    """
     files = sorted(path for path in folder.glob(pattern) if path.is_file())
     sizes = [path.stat().st_size for path in files]
     draw = random.Random(41)
@@ -114,7 +118,7 @@ def test_a_flipped_bit_is_named_or_changes_no_value(damaged: Path, pattern: str)
         path.write_bytes(content)
         why = find_failure(damaged)
         if why:
-            # A damaged checksum is taken for a damaged file; the line names both.
+            # A damaged checksum looks like a damaged file; the line names both.
             assert str(path.relative_to(damaged)) in why
             assert len(why.splitlines()) == 1
         else:
@@ -141,7 +145,7 @@ def test_a_flipped_bit_in_the_files_of_a_killed_recorder_is_named(
         running.run(0.5)
         recorder.drain()
         recorder._spool.flush(now=True)
-        # As one that is killed leaves it.
+        # Leave the spool as a killed recorder would.
         shutil.copytree(folder, copy)
     assert [*copy.glob(pattern)]
     for path, content in flipped_bits(copy, pattern, FLIPS):
@@ -175,7 +179,7 @@ def test_nan_in_a_sensor_leaves_strict_json(tmp_path: Path, rack_name: str) -> N
     (event,) = [one for one in found if one.get("code") == "sensor_range"]
     assert event["value"] is None
     assert "nan" in event["text"]
-    # As a program reads it, the number is there again.
+    # Programs that read the line get NaN again.
     (event,) = [
         one for one in Recording(tmp_path / "run").events if one.get("value") != one.get("value")
     ]
@@ -216,7 +220,7 @@ CASES = [
 def test_every_command_on_a_run_refuses_a_fifo_or_a_device_for_a_file(
     damaged: Path, tmp_path: Path, command: str, name: str
 ) -> None:
-    # Otherwise the report that is there is right.
+    # Without this, the stored report would be up to date.
     (damaged / "report.json").unlink()
     for take_place in PLACES:
         (damaged / name).unlink(missing_ok=True)

@@ -1,5 +1,4 @@
-"""What the machine did to its cores: time that the hypervisor took, misses meanwhile, and the
-processor's frequency."""
+"""Measurements of the cores during a run: steal, misses meanwhile, and frequencies."""
 
 from __future__ import annotations
 
@@ -66,7 +65,7 @@ def test_frequencies_come_from_cpuinfo_without_cpufreq(machine: Path) -> None:
         )
         found.look()
     assert found.record().mhz == ((0, 1200.5, 2600.0), (1, 900.0, 900.0))
-    # A core of its own file; another is switched off.
+    # One core has a frequency file, another core is offline.
     for core, text in ((0, "3100000\n"), (1, "")):
         path = machine / f"cpu{core}" / "cpufreq" / "scaling_cur_freq"
         path.parent.mkdir(parents=True)
@@ -76,8 +75,7 @@ def test_frequencies_come_from_cpuinfo_without_cpufreq(machine: Path) -> None:
 
 
 def run(folder: Path, config: Path, record: CoreRecord) -> Recording:
-    """Return a recording in real time with three misses, and what the machine did to its cores
-    meanwhile."""
+    """Return a recording in real time with three misses and this record of the cores."""
     late = [Cycle(tick, (0.1, 0.1, 2.6, 0.1), flags=int(Flag.MISSED)) for tick in (10, 20, 30)]
     found = recorded(
         folder, load(config, ["clock.mode=realtime", "board.lower.core=1"]), {"lower": late}

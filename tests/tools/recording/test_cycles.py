@@ -1,5 +1,4 @@
-"""Measured budgets: what levels took of a processor, on made-up traces and on racks that compute
-for known times."""
+"""Measured budgets, on synthetic traces and on racks that compute for known times."""
 
 from __future__ import annotations
 
@@ -55,7 +54,7 @@ def test_preemption_by_the_executor_is_not_planner_time(config: RackConfig, tmp_
     plan = Cycle(SETTLED, (0.0, 0.1, 3.1, 2.6), late=1.4, processor=3.2, flags=PLANNED)
     recording = recorded(tmp_path / "run", config, {"lower": executor, "lower.planner": [plan]})
     found = measured_budgets(recording)["lower"]
-    # Its reading is part of P. U began at 6 ms and was preempted from 7.5 ms on.
+    # Reading is part of P. U began at 6 ms and was preempted from 7.5 ms on.
     assert found.plan_ns == round((0.1 + 1.8) * MS)
     assert found.update_ns == round(1.3 * MS)
 
@@ -105,7 +104,7 @@ def test_a_recording_without_the_new_times_is_refused_in_one_line(
 def measured_run(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> Recording:
-    """A run of fig2, in the mode that is the fixture's parameter, with an executor of 1 ms."""
+    """A run of fig2 with an executor of 1 ms, in the mode that the fixture's parameter names."""
     folder = tmp_path_factory.mktemp("figure") / "run"
     settings = [
         f"name=test-cycles-{os.getpid()}",
@@ -121,7 +120,7 @@ def measured_run(
 def test_measured_times_match_known_computing_times(
     measured_run: Recording,
 ) -> None:
-    # The median of all cycles: a host that takes the machine away must not fail this test.
+    # Use the median, so that a host that takes the machine away does not fail this test.
     found = measured_budgets(measured_run, 50.0)["level"]
     expected = {
         "read_ns": 1.0,
@@ -130,7 +129,7 @@ def test_measured_times_match_known_computing_times(
         "plan_ns": 6.0,
         "update_ns": 1.0,
     }
-    # Each access and each look at the clock takes some time more than asked for.
+    # Each access and each reading of the clock adds some time.
     assert {name: getattr(found, name) / MS for name in expected} == pytest.approx(
         expected, rel=0.08, abs=0.15
     )

@@ -1,5 +1,7 @@
-"""The flight recorder: a bounded folder, in which the last stretch and what surrounds an occasion
-stay, and every row that had to be kept is proved to be there."""
+"""The flight recorder: its folder stays small, and all required rows are kept.
+
+Required are the last stretch and the time around each occasion.
+"""
 
 from __future__ import annotations
 
@@ -70,7 +72,7 @@ def config(small: Path, rack_name: str) -> RackConfig:
 
 @pytest.fixture(scope="module")
 def long_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunResult, StretchCounter]:
-    """A run of a minute: its result, and how many stretches there were meanwhile."""
+    """A run of one minute: its result, and the number of stretches in each second."""
     folder = tmp_path_factory.mktemp("flight")
     (folder / "small.toml").write_text(SMALL)
     config = load(folder / "small.toml", [f"name=test-flight-{os.getpid()}", RECORD, FAULT])
@@ -85,7 +87,7 @@ def test_a_long_run_does_not_grow_and_keeps_the_time_around_a_fault(
     folder = display.folder
     assert (result.worked, result.recording) == (True, "complete")
     late = {second: count for second, count in display.counts.items() if second > 2 * KEEP_S}
-    # The fault's end and the message that was missed by its reader are occasions, too.
+    # The end of the fault, and the miss that its reader detected, are occasions as well.
     assert max(late.values()) <= KEEP_S + 2 * AROUND_S + 1 + LEEWAY
     assert max(late.values(), default=0) > KEEP_S - LEEWAY
     recording = Recording(folder)
@@ -114,7 +116,7 @@ def test_removed_stretches_count_neither_as_lost_nor_as_gaps(
     assert report["kept"] == recording.kept_text
     assert f"- {recording.kept_text}\n" in text
     assert (report["rows_lost"], report["gaps"], report["untraced"]) == ({}, [], {})
-    # No plan was as old as the stretch that is missing.
+    # Ages must not span the removed stretch.
     assert report["tasks"]["lower"]["plan_age_ms"]["max"] < 100
     with pytest.raises(Failure, match=r"the rest was not kept.*cannot be compared"):
         first_difference(recording, recording)
@@ -122,7 +124,7 @@ def test_removed_stretches_count_neither_as_lost_nor_as_gaps(
     replay([folder], made, against=None)
     shown = read(made, "/signals/lower.status/count")
     assert shown.ticks.tolist() == recording.signal("lower.status", "tick").tolist()
-    # No age is shown where nothing was kept.
+    # The viewer must not show an age where nothing was kept.
     ages = read(made, "/ages/lower.status").ticks
     assert len(ages)
     (_, gone), (back, _) = recording.kept
@@ -140,13 +142,13 @@ def test_a_restarted_flight_recorder_continues_with_the_next_stretch(
     assert (result.worked, result.recording) == (True, "complete")
     recording = Recording(tmp_path / "run")
     ticks = recording.trace("lower")["tick"]
-    # What the first one had not removed stays.
+    # Stretches that the first recorder had not removed are kept.
     assert np.isin(np.arange((FAULT_S - AROUND_S) * SECOND, 25 * SECOND), ticks).all()
     assert not any(recording.lost.values())
 
 
 def record_flight(rack: Rack, folder: Path, seconds: float) -> Recorder:
-    """Run a rack, and record it in this process; return the recorder, to be closed."""
+    """Run a rack and record it in this process. Returns the recorder, which is still open."""
     folder.mkdir()
     (folder / CONFIG).write_text(rack.config.text())
     recorder = Recorder(rack.segment, folder)
@@ -158,7 +160,7 @@ def record_flight(rack: Rack, folder: Path, seconds: float) -> Recorder:
 
 
 def find_missing_rows(segment: Segment, folder: Path) -> tuple[set[str], list[tuple[int, int]]]:
-    """Return the rings of which rows lack, and the ticks that had to be kept and are not there."""
+    """Return the rings with missing rows, and the required ticks that were not kept."""
     left, keeping = tally(folder), Retention.of(segment)
     assert left is not None
     assert keeping is not None
@@ -181,13 +183,13 @@ def test_a_recording_is_complete_only_if_every_required_tick_is_kept(
         record_flight(rack, folder, seconds=10.0).close()
         assert find_missing_rows(segment, folder) == (set(), [])
         stretches = sorted((folder / STRETCHES).iterdir())
-        # The last two may hold no rows: they begin when the run ends.
+        # The last two stretches begin when the run ends, and may hold no rows.
         around, last = stretches[1], stretches[-3]
         for path in (around, last):
             whole = path.read_bytes()
             path.unlink()
             lacking, absent = find_missing_rows(segment, folder)
-            # A file that is gone is not damage of another: it counts as removed, which it must not.
+            # A deleted stretch is no damage, but it counts as removed although it was required.
             assert not lacking
             assert absent
             path.write_bytes(whole)

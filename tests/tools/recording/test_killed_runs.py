@@ -1,5 +1,7 @@
-"""SIGKILL of a run's recorder, of its launcher, or of all its processes, at any instant: at most
-one second of rows is lost, and every table opens."""
+"""SIGKILL of a run's recorder, of its launcher, or of all its processes, at any instant.
+
+At most one second of rows is lost, and every table can be opened.
+"""
 
 from __future__ import annotations
 
@@ -50,10 +52,10 @@ def list_process_family(pid: int) -> list[int]:
 def count_ticks_lost_by_a_kill(
     folder: Path, name: str, victim: str, seed: int, record: str = ""
 ) -> int:
-    """Run the small rack in real time, kill at a random instant; return the rows of its fastest
-    task that were written by then and are not in the files, all of which are opened.
+    """Run the small rack in real time, and kill at a random instant.
 
-    `record` is a table of its config.
+    Returns the number of rows of its fastest task that were written by that instant but are not in
+    the files. All tables are opened. `record` is a table of its config.
     """
     folder.mkdir(exist_ok=True)
     (folder / "small.toml").write_text(SMALL + record)
@@ -69,7 +71,7 @@ def count_ticks_lost_by_a_kill(
         recorder = segment.words[System.FOLLOWER_PID]
         gone = os.pidfd_open(recorder)
         at = segment.words[System.TICK] + random.Random(seed).uniform(0, LATEST_S) * TICKS_A_SECOND
-        # Where the recorder has begun late, the run may be over before that.
+        # If the recorder started late, the run may end before the kill.
         at = min(at, RUN_S * TICKS_A_SECOND - 1)
         wait_until(lambda: segment.words[System.TICK] >= at, BOUND_S)
         struck = {
@@ -82,7 +84,7 @@ def count_ticks_lost_by_a_kill(
             with suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
         process.wait(BOUND_S)
-        # A process of several threads may still hold its files when it counts as dead.
+        # A process with several threads may still hold its files when it is reported dead.
         ended = select.poll()
         ended.register(gone, select.POLLIN)
         assert ended.poll(BOUND_S * 1e3)
@@ -99,7 +101,7 @@ def count_ticks_lost_by_a_kill(
         try:
             RrdReader(str(part)).stream().to_chunks()
         except ValueError as error:
-            # Killed before its first block was written.
+            # The recorder was killed before it wrote its first block.
             if "No recording store found" not in str(error):
                 raise
     newest = int(recording.trace("lower")["tick"][-1])

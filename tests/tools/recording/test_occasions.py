@@ -1,4 +1,4 @@
-"""Which occasions a flight recorder keeps for good, and which it does not."""
+"""The occasions around which a flight recorder keeps everything."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.thorough]
 
 
 def build_trace(flags: list[int]) -> np.ndarray:
-    """Return records of a task, ticks 100 and so on, by their flags."""
+    """Return trace records with these flags, from tick 100 on."""
     rows = np.zeros(len(flags), RECORD)
     rows["tick"] = 100 + np.arange(len(flags))
     rows["flags"] = flags
@@ -39,7 +39,7 @@ def test_misses_holds_and_alarms_except_commands_are_occasions(small: Path, rack
         status = rings(segment)["lower.status"].drain().rows.copy()
         status["message"]["state"] = State.EXECUTING
         assert list(occasions.within("lower.status", status)) == []
-        # It begins, lasts over the end of what was drained, and ends.
+        # A hold begins, lasts beyond the end of the drained rows, and ends.
         status["message"]["state"][-3:] = State.HOLDING
         assert list(occasions.within("lower.status", status)) == [int(status["tick"][-3])]
         status["message"]["state"][:2] = State.HOLDING

@@ -1,5 +1,4 @@
-"""The recorder: everything that was written, in order, and no trace of itself in what was
-written."""
+"""The recorder takes everything that was written, in order, without influence on the run."""
 
 from __future__ import annotations
 

@@ -1,5 +1,7 @@
-"""Recorders that are killed, stopped or late: the run continues, what was written stays readable,
-and the user gets a message."""
+"""Recorders that are killed, stopped or late.
+
+The run continues, recorded rows stay readable, and the user gets a message.
+"""
 
 from __future__ import annotations
 
@@ -59,14 +61,14 @@ def test_a_killed_recorder_is_restarted_and_continues_where_it_stopped(
     recording = Recording(tmp_path / "run")
     restarted = "the recorder ended with status -9; restarted, 1 of at most 3 times"
     assert notes_of(recording)[0] == restarted
-    # In lockstep the clock waits for the next one as it did for the first: not one row is missing.
+    # In lockstep the clock waits for the next recorder as for the first, so no row is missing.
     serials = recording.signal("lower.status", "serial")
     assert np.array_equal(serials, np.arange(1, result.outcome.ticks + 1))
     assert not any(recording.lost.values())
     whole = run_rack(config, LONG_S, tmp_path / "whole", Display())
     assert result.outcome.digest == whole.outcome.digest
     assert counts(recording) == counts(Recording(tmp_path / "whole"))
-    # The viewer's file is not written over.
+    # The viewer's file is not overwritten.
     assert {"run.rrd", "run-2.rrd"} < {path.name for path in (tmp_path / "run").iterdir()}
 
 
@@ -77,7 +79,7 @@ def test_a_stopped_recorder_is_replaced_without_losing_rows(
 ) -> None:
     display: AtTick = Held(config.name, signal.SIGSTOP)
     if mode == "realtime":
-        # The rings hold two seconds: the whole run.
+        # The rings hold two seconds, which is the whole run.
         display, config = AtTick(signal.SIGSTOP), realtime(config)
     seconds = LONG_S if mode == "lockstep" else 2.0
     result = run_rack(config, seconds, tmp_path / "run", display, step=mode == "lockstep")
@@ -109,7 +111,7 @@ def test_lockstep_waits_for_a_late_recorder_and_real_time_does_not(
     [
         ("kind = 'drop', at = 0.4, for = '0.4s'", "lower"),
         ("kind = 'masquerade', at = 0.4", "lower"),
-        # In each cycle as many messages as the ring of a slow task holds in a second.
+        # Each cycle sends as many messages as the ring of a slow task holds for a second.
         ("kind = 'babble', at = 0.4, for = '1s', writes = 25", "upper"),
     ],
     ids=["drop", "masquerade", "babble"],
@@ -144,7 +146,7 @@ def test_a_run_whose_recorder_dies_too_often_fails_and_reports_missing_rows(
     assert missing.items() <= recording.lost.items()
     worst = max(result.rows_lost, key=lambda name: (result.rows_lost[name], name))
     (gap,) = recording.gaps()
-    # Slow rings lack what came since their last message.
+    # Slow rings lack the rows after their last message.
     assert (gap.first <= taken["lower"], gap.last) == (True, ticks - 1)
     assert set(gap.rings) == set(result.rows_lost)
     others = f"and rows of {len(result.rows_lost) - 1} more tasks and mailboxes"
@@ -221,7 +223,7 @@ def test_a_truncated_spool_yields_all_complete_lines(config: RackConfig, tmp_pat
 def test_a_spool_is_locked_until_the_files_built_from_it_are_in_place(
     config: RackConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Otherwise two programs that open the run of a killed recorder at once damage it."""
+    """Without the lock, two programs that open a killed recorder's run at once would damage it."""
     with Rack(config) as rack:
         Recorder(rack.segment, tmp_path)._spool.close()
     refused = []
@@ -244,7 +246,7 @@ def test_a_gap_keeps_its_position_when_files_are_rebuilt(
     spool = Spool(tmp_path, wire(config), Launch(*range(1, 1 + len(Launch._fields))))
     spool.add("lower", rows[:100], 0)
     spool.flush(now=True)
-    # Two drains that one flush writes, with rows lost between them.
+    # One flush writes two drains, with rows lost between them.
     spool.add("lower", rows[100:120], 0)
     spool.add("lower", rows[220:], 100)
     spool.flush(now=True)

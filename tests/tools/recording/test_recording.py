@@ -1,5 +1,7 @@
-"""Folders of runs that are damaged: one line names the file and what is wrong; what can be read is
-read."""
+"""Damaged folders of runs: one line names the file and the damage.
+
+Undamaged parts can still be read.
+"""
 
 from __future__ import annotations
 
@@ -49,7 +51,7 @@ def damaged(run: Path, tmp_path: Path) -> Path:
 
 
 def assert_refused(folder: Path, name: str) -> None:
-    """Have every reader refuse the folder with one line that names the file."""
+    """Check that every reader refuses the folder with one line that names the file."""
     for reader in READERS:
         with pytest.raises(Failure, match=name.replace(".", r"\.")) as caught:
             reader(folder)
@@ -69,7 +71,7 @@ def test_a_config_cut_off_at_the_end_of_a_table_is_named(damaged: Path) -> None:
     path = damaged / "config.toml"
     whole = path.read_text()
     path.write_text(whole[: whole.rindex("\n[") + 1])
-    # It is a valid config still.
+    # The truncated text is still a valid config.
     loads(path.read_text())
     assert_refused(damaged, path.name)
 
@@ -132,7 +134,7 @@ def test_a_long_run_has_many_parts_which_are_one_table(
     folder.mkdir()
     for name in ("config.toml", "cycles.parquet"):
         shutil.copy(damaged / name, folder / name)
-    # What a killed recorder has left is replaced.
+    # Files of a killed recorder are replaced.
     for _ in range(2):
         signals = signal_tables(folder / "signals", recording.layout)
         for box in recording.layout.timed:

@@ -1,5 +1,4 @@
-"""Signals by name: fields of messages, single numbers of them, names in place of numbers; and
-conditions on them."""
+"""Signals and conditions in the form in which users write them."""
 
 from __future__ import annotations
 
@@ -16,7 +15,7 @@ from rack.tools.recording.signal import Signal, Trigger
 
 
 class Gait(IntEnum):
-    """What the walker does."""
+    """States of the walker."""
 
     STANDS = 0
     WALKS = 1

@@ -1,5 +1,4 @@
-"""What took the cycles of a run: steal, a core that was away without it, a quota. None of it enters
-a budget."""
+"""Causes of lost cycles: steal, absences without steal, and quotas. None enters a budget."""
 
 from __future__ import annotations
 
@@ -35,7 +34,7 @@ SETTLED = 40
 FIRST = obtained_core(0)
 """The clock's core."""
 OTHER = FIRST + 1
-"""The core of the lower level and its planner, whatever this machine has."""
+"""The core of the lower level and of its planner, whatever cores this machine has."""
 
 
 @pytest.fixture
@@ -45,12 +44,12 @@ def config(small: Path) -> RackConfig:
 
 
 def skipping(count: int) -> int:
-    """Return the flags of a cycle before which so many releases were skipped."""
+    """Return the flags of a cycle before which `count` releases were skipped."""
     return count << SKIPPED_SHIFT | int(Flag.SKIPPED)
 
 
 def resumed_at(end_ms: float, skips: int = 2) -> Cycle:
-    """Return the first cycle after a stall that ended then, and cost so many releases."""
+    """Return the first cycle after a stall that ended at `end_ms` and cost `skips` releases."""
     return Cycle(int(end_ms // TICK_MS), PLAIN, late=end_ms % TICK_MS, flags=skipping(skips))
 
 
@@ -59,8 +58,7 @@ def plain_cycles(first: int, last: int) -> list[Cycle]:
 
 
 def late_clock(tick: int, since: int, late_ms: float) -> dict[str, Any]:
-    """Return the event of the clock's board that was due at tick `since`, and woke that much
-    later."""
+    """Return the event of a clock board that was due at tick `since` and woke `late_ms` later."""
     about = {"kind": "miss", "board": "clock", "code": "clock_late", "text": "", "time_ns": 0}
     return about | {"tick": tick, "since": since, "value": late_ms * MS}
 
@@ -95,7 +93,7 @@ def test_skipped_cycles_are_attributed_to_steal_of_their_core(
         config,
         {"lower": [*plain_cycles(8, 15), skipped, Cycle(30, PLAIN, flags=skipping(2))]},
     )
-    # Releases 15 to 19 were skipped; the record after them begins at tick 20.
+    # Releases 15 to 19 were skipped. The next record begins at tick 20.
     for first, last, during in ((14.0, 14.8, 0), (15.2, 16.0, 5), (19.2, 19.8, 5), (20.2, 20.9, 0)):
         span = Stolen(int(first * TICK_MS * MS), int(last * TICK_MS * MS), OTHER, 10)
         recording.cores = CoreRecord(100 * MS, (span,))
@@ -125,7 +123,7 @@ def test_stalls_that_end_at_the_same_phase_suggest_a_quota(
 def test_overlapping_losses_count_as_one_stall(config: RackConfig, tmp_path: Path) -> None:
     ends = [100.0 * k + 31.2 for k in range(1, 7)]
     upper = [Cycle(int((end - 15) // TICK_MS), PLAIN, late=15.4, flags=MISSED) for end in ends]
-    # The stall begins within a cycle, which is late; those after it are skipped.
+    # The stall begins within a cycle, which is late. The next cycles are skipped.
     struck = [Cycle(int(end // TICK_MS) - 3, (0.0, 0.1, 7.2, 0.1), flags=MISSED) for end in ends]
     both = [cycle for pair in zip(struck, map(resumed_at, ends), strict=True) for cycle in pair]
     found = find_stalls(run(tmp_path / "run", config, {"upper": upper, "lower": both}))
@@ -145,14 +143,13 @@ def test_a_level_with_the_period_of_the_stalls_is_a_possible_cause(
         " upper or a quota of the host\n"
     )
     assert line in markdown(report_of(recording))
-    # At another release of the quota, as many ends lie at two phases of that level.
+    # With another phase of the quota, the ends lie at two phases of the level.
     either = [resumed_at(100.0 * k + 31.2) for k in range(6)]
     assert find_stalls(run(tmp_path / "run", config, {"lower": either})).quota == Quota(6, 6, [])
 
 
 def absence_trace() -> dict[str, list[Cycle]]:
-    """Return traces in which the other core was away from tick 50, its release, until 1 ms after
-    tick 52."""
+    """Return traces in which the other core was away from tick 50 until 1 ms after tick 52."""
     return {
         "lower": [
             *plain_cycles(SETTLED, 50),
@@ -186,7 +183,7 @@ def test_a_core_that_ran_another_task_was_not_absent(config: RackConfig, tmp_pat
 def test_a_task_without_real_time_priority_shows_no_absence(
     config: RackConfig, tmp_path: Path
 ) -> None:
-    # The launch was refused all of them.
+    # The launch obtained no real-time priority.
     long = {"upper": [Cycle(48, (0.0, 0.1, 15.0, 0.1)), Cycle(88, PLAIN)]}
     late = late_clock(52, since=50, late_ms=5.9)
     refused = run(tmp_path / "refused", config, absence_trace() | long, late, priority=0)
@@ -233,7 +230,7 @@ def test_stalled_cycles_do_not_count_towards_a_budget(config: RackConfig, tmp_pa
     assert cycles_of(computed)["lower"].stalled == 0
     stolen = run(tmp_path / "stolen", config, trace)
     stolen.cores = CoreRecord(200 * MS, (Stolen(126 * MS, 130 * MS, OTHER, 10),))
-    # The clock's board was away meanwhile, so the whole machine may have been.
+    # The clock board was away at that time, so the whole machine may have been.
     away = run(tmp_path / "away", config, trace, late_clock(52, since=51, late_ms=3.0))
     for recording in (stolen, away):
         assert measured_budgets(recording)["lower"].process_ns == MS
@@ -242,5 +239,5 @@ def test_stalled_cycles_do_not_count_towards_a_budget(config: RackConfig, tmp_pa
         task = document(analysis)["tasks"]["lower"]
         left = len(trace["lower"]) - 1
         assert (task["cycles"], task["start_up"], task["stalled"]) == (left, 0, 1)
-        # The report's own times are of all cycles.
+        # The report gives the times of all cycles.
         assert report_of(recording)["tasks"]["lower"]["execution_ms"]["max"] == 6.3

@@ -1,5 +1,4 @@
-"""Recordings of several racks on one time line: what racks record of each other's clocks leads from
-one to the next."""
+"""Recordings of several racks on one time line, connected by their clock comparisons."""
 
 from __future__ import annotations
 
@@ -16,14 +15,13 @@ from tests.tools.machines import CLOCK_NS, ERROR_NS, MS, TICKS, A, B, C, Machine
 
 
 def check_place(place: RackPlace, own: Machine, line: Machine) -> None:
-    """Check that each tick is on the line where its true time is, within the uncertainty."""
+    """Check that the time of each tick is right within the uncertainty."""
     ticks = np.arange(0, TICKS, 7)
     found = place.times_ns(ticks, 0)
     true = [line.shows(own.true_ns(int(tick))) - line.epoch_ns for tick in ticks]
     apart_ns = np.abs(found - np.array(true) * line.speed)
     assert apart_ns.max() <= place.uncertainty_ns * line.speed + MS // 1000
-    # It says no more than it has to: what one comparison left open, and the drift where there was
-    # none.
+    # The uncertainty covers only the error of a comparison and the drift between comparisons.
     assert place.uncertainty_ns <= (ERROR_NS + 7 * S * DRIFT_PPM // 1_000_000) * len(place.shifts)
 
 
@@ -37,7 +35,7 @@ def test_a_rack_is_on_the_line_of_another_within_the_stated_uncertainty(
     check_place(second, B, A)
     assert (first.times_ns(np.arange(TICKS), 5) == np.arange(TICKS) * CLOCK_NS + 5).all()
     assert first.uncertainty_ns == 0
-    # The other one's wall clock does not count: it may be wrong.
+    # The other rack's wall clock does not count, because it may be wrong.
     stamps = np.array([B.shows(3 * S)])
     assert (
         second.wall_ns(stamps)[0] - first.wall_ns(np.array([A.shows(3 * S)]))[0]

@@ -1,4 +1,4 @@
-"""Two runs compared: the message that differs, whether its inputs did, and the cause."""
+"""Comparison of two runs: the message that differs, its inputs, and the cause."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def ran(rack_name: str, tmp_path: Path) -> Run:
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Run, Recording, Recording]:
-    """What runs the same rack again, a run, and one with another parameter of its level."""
+    """A function that runs the same rack again, a run, and a run with another parameter."""
     run = run_in(tmp_path_factory.mktemp("against"), f"test-against-{os.getpid()}")
     return run, run("one", REMEMBERING), run("two", REMEMBERING, "board.wave.params.factor=2")
 
@@ -107,7 +107,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Run, Recording, Reco
 def explain_difference(
     one: Recording, other: Recording, *, of: str = "", repeats: bool = True
 ) -> dict[str, Any]:
-    """Return what the report says of two runs."""
+    """Return the explanation in the report of two runs."""
     return compared(one, OtherRun(other.folder, of, repeats))
 
 
@@ -160,7 +160,7 @@ def test_a_branch_shows_the_state_of_the_level_at_its_first_tick(
     repetition = found["repetition"]
     assert {"name": "_factor", "here": 2.0, "there": 1.0} in repetition["attributes"]
     assert (repetition["because"], repetition["strays"]) == ("state", {})
-    # What it remembers is the first run's: only the parameter has changed it.
+    # The branch has the memory of the first run, changed by the parameter alone.
     assert {one["name"] for one in repetition["attributes"]} == {"_factor", "_half"}
 
 
@@ -185,7 +185,7 @@ def test_a_fault_is_the_cause_and_nothing_is_repeated(
     assert {clue["kind"] for clue in cycle["clues"]} == kinds
     assert {clue["run"] for clue in cycle["clues"]} == {str(two.folder)}
     assert (found["repetition"], found["not_repeated"]) == (None, "")
-    # From the watching level, which takes note of a loss, back to the board that was killed.
+    # The chain leads from the watching level, which noticed a loss, to the killed board.
     if "died" in kinds:
         away = explain_difference(one, two, of="watch.status")["chain"]
         assert [cycle["mailbox"] for cycle in away] == ["watch.status", "wave.status"]
@@ -207,7 +207,7 @@ def test_a_level_whose_code_has_changed_is_named(ran: Run, tmp_path: Path) -> No
     repetition = found["repetition"]
     assert (repetition["because"], repetition["runs"]) == ("code", (str(one.folder),))
     assert repetition["attributes"] == ()
-    # The other level only passes on what it has read.
+    # The other level only forwards its input.
     chain = explain_difference(one, two, of="passing.sum", repeats=False)["chain"]
     assert [(one["mailbox"], one["unequal"]) for one in chain] == [
         ("passing.sum", "adding.sum"),

@@ -1,4 +1,4 @@
-"""Objects and their goals: what ended elsewhere fails the run, and what fell is in the report."""
+"""Objects and their goals: a wrong final position fails the run, and falls are reported."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_an_object_released_in_the_air_is_reported_with_its_fall(
     (tmp_path / "drop.py").write_text(DROP)
     own = ["host.command.params.script=drop.py", f'python_path=["{tmp_path}"]', GOAL]
     config = load("chimera", [f"name={rack_name}", "clock.mode=lockstep", *own])
-    # It lands where it stood: only the report tells.
+    # The object lands at its old place, so only the report shows the fall.
     assert run_rack(config, None, tmp_path / "run", Display()).worked
     report, text = write_report(tmp_path / "run")
     (end,) = report["objects"]

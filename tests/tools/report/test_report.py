@@ -1,4 +1,4 @@
-"""Reports: the numbers of a run, from its recording alone."""
+"""Reports contain the figures of a run, computed from its recording alone."""
 
 from __future__ import annotations
 
@@ -43,13 +43,13 @@ def test_the_messages_of_other_systems_have_the_names_that_the_report_looks_for(
 
 
 class Watchful(Display):
-    """Looks often: a run in lockstep is soon over."""
+    """Looks often, because a run in lockstep ends soon."""
 
     period_s = 0.02
 
 
 def cycle(tick: int, late: float, read: float, process: float, write: float) -> tuple[int, ...]:
-    """Return a trace record of a cycle of a 10 ms task, of times in ms."""
+    """Return a trace record of a cycle of a 10 ms task, given times in ms."""
     release = tick * 10 * MS
     times = np.cumsum([release, late * MS, 0, read * MS, process * MS, write * MS]).astype(int)
     return (tick, *times.tolist(), 0, 0, round((read + process + write) * MS), 0)
@@ -71,7 +71,7 @@ def test_times_of_a_task_follow_equation_3_5() -> None:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run in lockstep of two levels, of 40 and 5 ticks."""
+    """A lockstep run of two levels with periods of 40 and 5 ticks."""
     return slow_run(tmp_path_factory)
 
 
@@ -92,7 +92,7 @@ def test_measured_response_of_a_run_meets_its_prediction(folder: Path) -> None:
 
 
 class CutRecording(Recording):
-    """A recording without ten of the commands; `lost` says whether it is known to lack them."""
+    """A recording without ten of the commands. `lost` says whether their loss is known."""
 
     lost: ClassVar[dict[str, int]] = {"upper.command": 10}
 
@@ -102,7 +102,7 @@ class CutRecording(Recording):
 
 
 class SilentRecording(CutRecording):
-    """A run in which those commands were never written."""
+    """A recording of a run in which these commands were never written."""
 
     lost: ClassVar[dict[str, int]] = {}
 

@@ -1,5 +1,4 @@
-"""The report in a run's folder: shown as it is while it is newer than the recording and the
-program."""
+"""The stored report of a run is shown while it is newer than recording and program."""
 
 from __future__ import annotations
 
@@ -28,7 +27,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def make_newer(path: Path) -> None:
-    """Date a file after everything else."""
+    """Set the modification time of a file after all others."""
     later_ns = time.time_ns() + 10**9
     os.utime(path, ns=(later_ns, later_ns))
 

@@ -1,4 +1,4 @@
-"""Shapes of the view against MuJoCo's own geometry, for every kind of geom."""
+"""Shapes of the view agree with MuJoCo's geometry, for every kind of geom."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def model() -> mujoco.MjModel:
 
 
 def column(model: mujoco.MjModel, geom: str, name: str) -> np.ndarray:
-    """Return one component of a geom's shape, one row an instance."""
+    """Return one component of a geom's shape, one row per instance."""
     shape = shape_of(model, model.geom(geom).id)
     assert shape is not None
     batches = {

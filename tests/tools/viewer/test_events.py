@@ -1,4 +1,4 @@
-"""The log of the viewer: the events of the run, without those of a slow launch."""
+"""The viewer's log contains the events of the run, but not the waits of its launch."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Forces in a recording: arrows where they are sensed, and curves of what is wanted and exerted."""
+"""Forces in the view: arrows at sensed places, and curves of wanted and exerted forces."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def cell(tmp_path: Path) -> Cell:
 
 
 class Written:
-    """A recording of one message type, which a part of the view writes."""
+    """A recording of one message type, written by a part of the view."""
 
     def __init__(self, folder: Path) -> None:
         self.file = folder / "run.rrd"
@@ -39,7 +39,7 @@ class Written:
     def write(
         self, kind: type[Message], cell: Cell, parts: Iterable[ViewPart], **fields: np.ndarray
     ) -> None:
-        """Write `ROWS` messages with these fields, one a tick."""
+        """Write `ROWS` messages with these fields, one per tick."""
         dtype = [
             ("tick", "i8"),
             ("stamp_ns", "i8"),

@@ -1,5 +1,4 @@
-"""Several racks in one recording for the viewer: each below its name, on the time line of the
-first."""
+"""Several racks in one recording for the viewer, on the time line of the first."""
 
 from __future__ import annotations
 
@@ -29,8 +28,7 @@ LIVE = ("/recorder/load",)
 
 
 def read_contents(file: Path) -> dict[tuple[str, str], Any]:
-    """Return all values of all components in a file, in the order of ticks, by entity and
-    component."""
+    """Return the values of all components in a file by entity and component, sorted by tick."""
     found: dict[tuple[str, str], list[Any]] = {}
     for chunk in RrdReader(str(file)).stream().to_chunks():
         if chunk.entity_path.startswith(("/__", *LIVE)):
@@ -54,8 +52,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 def test_a_view_built_from_files_equals_the_recorders_view(run: Recording, tmp_path: Path) -> None:
     write_merged(on_one_time_line([run]), tmp_path / "again.rrd", lambda part: None)
     again, live = read_contents(tmp_path / "again.rrd"), read_contents(run.folder / "run.rrd")
-    # Rows of losses come with each block, and blocks are cut elsewhere; so are the ends of lines of
-    # limits.
+    # Losses and limits are written once per block, and the blocks differ.
     loose = ("/recorder/rows_lost", "limits")
     assert again.keys() == live.keys()
     for key, rows in live.items():
@@ -104,7 +101,7 @@ def test_the_uncertainty_of_times_is_in_the_log(merged_file: Path) -> None:
 
 @pytest.fixture
 def branched_runs(rack_name: str, tmp_path: Path) -> Path:
-    """Runs "whole", and "other", which branches off at tick 150; the folder of both."""
+    """The folder of two runs: "whole", and "other", which branches off at tick 150."""
     file = tmp_path / "remembering.toml"
     file.write_text(REMEMBERING)
     config = load(file, [f"name={rack_name}"])

@@ -1,5 +1,4 @@
-"""Pictures without a screen: where there is no graphics driver either, and who can reach the viewer
-meanwhile."""
+"""Pictures without a screen: a missing graphics driver, and the viewer's network access."""
 
 from __future__ import annotations
 

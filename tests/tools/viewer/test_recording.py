@@ -1,4 +1,4 @@
-"""The recording for the viewer, read back: one short run of the whole rack."""
+"""The recording for the viewer, read back from a short run of the whole rack."""
 
 from __future__ import annotations
 
@@ -89,8 +89,8 @@ def test_an_age_belongs_to_the_newest_visible_message(run: Recording) -> None:
         (tick - made[visible <= tick].max()) * run.layout.clock_ns * 1e-6 for tick in rows.ticks
     ]
     assert rows.values.ravel() == pytest.approx(expected)
-    # Read at once by a board of its own rate or by a slower one: the age is the sampling delay of
-    # the paper.
+    # The message is read immediately by a board of equal or lower rate, so its age is the sampling
+    # delay of the paper.
     assert rows.values.min() == pytest.approx(250.0)
 
 
