@@ -162,6 +162,7 @@ def _budget(executor: Cycles, planner: Cycles | None, percentile: float) -> Budg
     """Return the budget of one level."""
 
     def worst_time(cycles: Cycles, times_ns: np.ndarray) -> int:
+        """Return the percentile of the times of all judged cycles."""
         return worst_of(times_ns[cycles.is_judged], percentile)
 
     planner_parts = {}

@@ -120,6 +120,7 @@ class Analysis:
         response = system_response(recording)
 
         def judge_equations(percent: float) -> tuple[RackTiming, tuple[Pair, ...]]:
+            """Return the measured timing at a percentile, and the verdicts on all equations."""
             budgets = without_interrupts(predicted, budgets_of(cycles, percent))
             rack = rack_timing(config, layout, budgets)
             observed = [*_system(response, rack), *_tasks(cycles, rack, percent), *used]
@@ -212,6 +213,14 @@ def core_loads(
 
     An executor counts at all of its releases, including skipped ones, so the load of an overloaded
     core exceeds 1.
+
+    Args:
+        recording: The run.
+        cycles_by_task: Its measured cycles.
+        rack: Timing of the rack.
+
+    Returns:
+        Loads by core. 1 is a fully used core.
     """
     first = min(int(rows["tick"][0]) for rows in recording.cycles.values())
     last = max(int(rows["tick"][-1]) for rows in recording.cycles.values())
@@ -227,7 +236,7 @@ def core_loads(
 
 
 def cycle_ns(rack: RackTiming, task: TaskSpec) -> int:
-    """Return R_i of a task's level."""
+    """Return R_i of a task's level, the time between two of its cycles."""
     return rack.boards[task.board].every * rack.tick_ns
 
 

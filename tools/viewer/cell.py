@@ -267,6 +267,7 @@ def planned_path(stream: Stream, cell: Cell) -> ViewPart:
         return np.array(data.site_xpos[cell.tool])
 
     def write(block: RowBlock) -> None:
+        """Write the plans in a block of messages."""
         for row, plan in enumerate(block.messages):
             way_points = plan["waypoints"][: plan["count"]]
             if plan["kind"] != SegmentKind.PATH or plan["error"]:

@@ -112,6 +112,7 @@ def row_losses(stream: Stream) -> Callable[[int, Mapping[str, int]], None]:
     logged = Counter[str]()
 
     def write(tick: int, lost: Mapping[str, int]) -> None:
+        """Write the total number of lost rows, and log the new losses."""
         nonlocal logged
         when = stream.times.moment_of(tick)
         counts = Counter(lost)
@@ -133,6 +134,7 @@ def recorder_load(stream: Stream) -> Callable[[int], None]:
     last = time.process_time(), time.monotonic()
 
     def write(tick: int) -> None:
+        """Write the processor load since the last call."""
         nonlocal last
         now = time.process_time(), time.monotonic()
         cpu_s, wall_s = np.subtract(now, last)

@@ -95,6 +95,7 @@ def contact_arrows(stream: Stream, cell: Cell, field: str) -> ViewPart:
     sampled_rows = row_sampler(stream.times.clock_ns)
 
     def write(block: RowBlock) -> None:
+        """Write the arrows of the rows that are drawn."""
         chosen = sampled_rows(block.ticks)
         if not len(chosen):
             return
@@ -128,7 +129,12 @@ def _wanted_and_exerted(axis: int, block: RowBlock) -> Array:
 
 
 def contact_forces(stream: Stream, most: tuple[float, float]) -> Iterator[ViewPart]:
-    """Yield the parts that show force and torque of a `Wrench`, with the arm's limits `most`."""
+    """Yield the parts that show force and torque of a `Wrench`.
+
+    Args:
+        stream: Where they are written.
+        most: The arm's limits on force, N, and torque, N m.
+    """
     for index, (quantity, unit) in enumerate(CONTACT_UNITS.items()):
         names = [f"limit, {unit}", f"{quantity} of the contact, {unit}"]
         values = partial(_limit_and_size, most[index], 3 * index)

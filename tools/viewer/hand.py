@@ -56,6 +56,7 @@ def _finger_curves(
     )
 
     def stack_tensions(block: RowBlock) -> np.ndarray:
+        """Return commanded, then sensed tensions of the finger, each flexors first."""
         columns = [
             block.messages[field][:, row][:, joints]
             for field in ("wanted", "tension")

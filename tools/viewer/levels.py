@@ -44,6 +44,7 @@ def value_lane(
     changed_rows = change_finder()
 
     def write(block: RowBlock) -> None:
+        """Write the name of the value wherever it changes."""
         values = block.messages[fields]
         rows = changed_rows(values)
         if len(rows):
@@ -83,6 +84,7 @@ def activity(stream: Stream, mailbox: MailboxSpec) -> Iterator[ViewPart]:
     changed_rows = change_finder()
 
     def write_errors(block: RowBlock) -> None:
+        """Write a log line for each new error."""
         messages = block.messages
         for row in changed_rows(messages["error"]):
             if error := messages["error"][row]:
@@ -99,6 +101,7 @@ def fired_rows(stream: Stream, mailbox: MailboxSpec) -> ViewPart:
     changed_rows = change_finder()
 
     def write(block: RowBlock) -> None:
+        """Write every change of the fired row to the lane and to the log."""
         changed = changed_rows(block.messages[FIRED])
         names = []
         for row_index in changed:

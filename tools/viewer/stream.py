@@ -173,6 +173,7 @@ def change_finder() -> Callable[[np.ndarray], Ints]:
     last: np.ndarray | None = None
 
     def changed_rows(values: np.ndarray) -> Ints:
+        """Return the indices of rows that differ from the row before, across blocks."""
         nonlocal last
         changed = values != np.concatenate((values[:1] if last is None else last, values[:-1]))
         changed[0] |= last is None
@@ -195,6 +196,7 @@ def row_sampler(clock_ns: int) -> Callable[[Ints], Ints]:
     last = -1
 
     def sampled_rows(ticks: Ints) -> Ints:
+        """Return the index of the first row of each drawing interval, across blocks."""
         nonlocal last
         slots, first = np.unique(ticks // every, return_index=True)
         chosen = first[slots > last]

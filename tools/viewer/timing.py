@@ -59,6 +59,7 @@ def cycle_lane(stream: Stream, task: TaskSpec, speed: float, lockstep: bool) -> 
     style_lane(stream, lane, PHASES, LETTERS)
 
     def write(block: RowBlock) -> None:
+        """Write the four spans of each cycle in a block."""
         rows = block.rows
         moments = np.stack([rows[name] for name in MOMENTS], axis=1)
         within = ((moments - rows["release_ns"][:, None]) * speed).astype(np.int64)
@@ -105,6 +106,7 @@ def load_curves(
     slice_ns = task.slice * period_ns
 
     def times_ms(block: RowBlock) -> np.ndarray:
+        """Return lateness, execution and deadline of each cycle, (rows, 3), ms."""
         rows = block.rows
         columns = np.full((len(rows), 3), np.nan)
         columns[:, 1] = execution_ns(rows) * 1e-6
@@ -134,6 +136,7 @@ def missed_cycles(stream: Stream, task: TaskSpec) -> ViewPart:
     span = max(1, round(SPAN_S * 1e9 / stream.times.clock_ns))
 
     def write(block: RowBlock) -> None:
+        """Mark the missed cycles of a block, and log them."""
         missed = np.flatnonzero(is_missed(block.rows))
         if not len(missed):
             return
