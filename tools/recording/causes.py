@@ -123,10 +123,12 @@ class Divergence:
         divergent: First differing message of each mailbox that differs, earliest first.
     """
 
-    def __init__(self, one: Recording, other: Recording) -> None:
-        self.runs = one, other
-        self.unlike = {unlike.mailbox: unlike for unlike in unlike_messages(one, other)}
-        self._begin, _ = common_ticks(one, other)
+    def __init__(self, first_run: Recording, second_run: Recording) -> None:
+        self.runs = first_run, second_run
+        self.unlike = {
+            message.mailbox: message for message in unlike_messages(first_run, second_run)
+        }
+        self._begin, _ = common_ticks(first_run, second_run)
 
     def chain(self, mailbox: str = "") -> tuple[UnlikeCycle, ...]:
         """Follow a difference back to its cause.
@@ -151,40 +153,40 @@ class Divergence:
             name = cycles[name].unequal
         return tuple(cycles.values())
 
-    def _cycle(self, unlike: UnlikeMessage) -> UnlikeCycle:
+    def _cycle(self, message: UnlikeMessage) -> UnlikeCycle:
         """Describe the cycle that wrote a differing message: its inputs and possible causes."""
         layout = self.runs[0].layout
-        box = layout.mailbox(unlike.mailbox)
+        box = layout.mailbox(message.mailbox)
         read = [source for source in layout.timed if box.writer in source.readers]
-        unequal = [source.name for source in read if self._was_unequal(source, box.writer, unlike)]
+        unequal = [source.name for source in read if self._was_unequal(source, box.writer, message)]
         first = min(unequal, key=lambda name: self.unlike[name].tick, default="")
-        clues = [*self._events(box, unlike)]
+        clues = [*self._events(box, message)]
         if box.writer != CLOCK:
-            clues += self._missed(layout.task(box.writer), unlike.tick)
+            clues += self._missed(layout.task(box.writer), message.tick)
         if not first and box.writer != CLOCK:
             clues += [*self._config(box.writer), *self._outside(box.writer)]
         return UnlikeCycle(
-            tick=unlike.tick,
+            tick=message.tick,
             mailbox=box.name,
             writer=box.writer,
-            fields=tuple(self._fields(box, unlike.serial)),
+            fields=tuple(self._fields(box, message.serial)),
             read=tuple(source.name for source in read),
             unequal=first,
             clues=tuple(clues),
         )
 
-    def _was_unequal(self, source: MailboxSpec, reader: str, unlike: UnlikeMessage) -> bool:
+    def _was_unequal(self, source: MailboxSpec, reader: str, message: UnlikeMessage) -> bool:
         """Return True if a task had read a differing message from a mailbox.
 
         Only what was visible in the cycle that wrote the task's own differing message counts.
         """
-        divergent = self.unlike.get(source.name)
+        earlier = self.unlike.get(source.name)
         grid = self.runs[0].layout.read_grid(source, reader)
-        release = unlike.tick - (unlike.tick - grid.phase) % grid.every
+        release = message.tick - (message.tick - grid.phase) % grid.every
         return (
-            divergent is not None
-            and divergent.visible_at <= release
-            and divergent.mailbox != unlike.mailbox
+            earlier is not None
+            and earlier.visible_at <= release
+            and earlier.mailbox != message.mailbox
         )
 
     def _fields(self, box: MailboxSpec, serial: int) -> Iterator[InBoth]:
@@ -205,7 +207,7 @@ class Divergence:
         if here["basis"] != there["basis"]:
             yield InBoth("basis", int(here["basis"]), int(there["basis"]))
 
-    def _events(self, box: MailboxSpec, unlike: UnlikeMessage) -> Iterator[Clue]:
+    def _events(self, box: MailboxSpec, message: UnlikeMessage) -> Iterator[Clue]:
         """Yield events of only one run that concern the writer of a message or the whole rack."""
         boards = {name.partition(".")[0] for name in (box.writer, box.name)}
         about = {CLOCK, box.writer, box.name, *boards}
@@ -213,7 +215,7 @@ class Divergence:
         for this_run, other_run, run in zip(
             event_clues, reversed(event_clues), self.runs, strict=True
         ):
-            row = row_of(run, box, unlike.serial)
+            row = row_of(run, box, message.serial)
             # A death is reported after the first message is missing, and perhaps none follows it.
             written = NEVER if row is None else int(row["tick"])
             unmatched = Counter(event.key for event in other_run)
@@ -222,7 +224,7 @@ class Divergence:
                 if event.clue.kind == "command" and box.writer != CLOCK:
                     continue
                 unmatched[event.key] -= 1
-                until = written if event.clue.kind == "died" else unlike.tick
+                until = written if event.clue.kind == "died" else message.tick
                 if unmatched[event.key] < 0 and about & {*event.about} and event.clue.tick <= until:
                     yield event.clue
 

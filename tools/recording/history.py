@@ -75,8 +75,8 @@ def _skipped(task: TaskSpec, tick: int, count: int) -> Document:
 def counted(entries: Sequence[Document]) -> tuple[int, int]:
     """Return how many cycles of a list from `list_misses` were late, and how many were skipped."""
     late, left_out = (
-        sum(miss["count"] for miss in entries if miss["what"] == what)
-        for what in ("late", "skipped")
+        sum(miss["count"] for miss in entries if miss["what"] == kind)
+        for kind in ("late", "skipped")
     )
     return late, left_out
 

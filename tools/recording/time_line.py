@@ -302,13 +302,13 @@ def _sighting(observer: RackGrid, peer: RackGrid) -> Shift | None:
         return None
     read = observer.recording.signal
     uncertainty = read(mailbox, "uncertainty")
-    known = uncertainty >= 0.0
-    if not known.any():
+    is_measured = uncertainty >= 0.0
+    if not is_measured.any():
         return None
-    ticks = read(mailbox, "tick")[known]
-    by_ns = np.rint(read(mailbox, "offset")[known] * 1e9).astype(np.int64)
+    ticks = read(mailbox, "tick")[is_measured]
+    by_ns = np.rint(read(mailbox, "offset")[is_measured] * 1e9).astype(np.int64)
     at_ns = observer.stamp_ns(ticks) + by_ns
-    seen_ns = np.rint(ticks * observer.clock_ns + read(mailbox, "ahead")[known] * 1e9)
+    seen_ns = np.rint(ticks * observer.clock_ns + read(mailbox, "ahead")[is_measured] * 1e9)
     disagreement_ns = peer.time_ns(at_ns) - seen_ns
     # A peer that had not started yet cannot be matched to a launch.
     is_this = (np.abs(disagreement_ns) <= TOLERANCE_NS) & (seen_ns > 0)
@@ -328,7 +328,7 @@ def _sighting(observer: RackGrid, peer: RackGrid) -> Shift | None:
     # The clocks may drift between two comparisons, before the first and after the last.
     ends = peer.stamp_ns(np.array(peer.ticks))
     longest_gap_ns = int(np.diff(np.sort(np.concatenate((at_ns, ends)))).max())
-    worst_ns = round(float(uncertainty[known][is_this].max()) * 1e9)
+    worst_ns = round(float(uncertainty[is_measured][is_this].max()) * 1e9)
     return Shift(at_ns, by_ns, worst_ns + longest_gap_ns * DRIFT_PPM // 1_000_000)
 
 

@@ -22,28 +22,28 @@ OF_CONFIG = ("config", "outside")
 """Kinds of clues that do not rule out a difference in the level's state."""
 
 
-def compared(recording: Recording, asked: OtherRun) -> Document:
+def compared(recording: Recording, other_run: OtherRun) -> Document:
     """Compare a run with another one, and explain the difference.
 
     Raises:
         Failure: The runs cannot be compared.
     """
-    divergence = Divergence(recording, Recording(asked.folder))
+    divergence = Divergence(recording, Recording(other_run.folder))
     first_miss = min(
         (miss["tick"] for run in divergence.runs for miss in misses(run)), default=None
     )
     first = next(iter(divergence.unlike.values()), None)
-    chain = divergence.chain(asked.of)
-    repetition = _repeated(divergence, chain[-1], asked.repeats) if chain else ""
-    other_folder = str(asked.folder)
+    chain = divergence.chain(other_run.of)
+    repetition = _repeated(divergence, chain[-1], other_run.repeats) if chain else ""
+    other_folder = str(other_run.folder)
     lines = [line for cycle in chain for line in _cycle_lines(cycle, other_folder)]
     why_not = ""
     if isinstance(repetition, Repetition):
         lines += _repetition_lines(repetition, chain[-1], other_folder)
     elif why_not := repetition:
         lines.append(f"not repeated: {why_not}")
-    if asked.of and not chain:
-        lines.append(f"{asked.of} is equal in both")
+    if other_run.of and not chain:
+        lines.append(f"{other_run.of} is equal in both")
     return {
         "folder": other_folder,
         "first_difference": first and asdict(Difference(first.tick, first.mailbox)),
@@ -147,8 +147,8 @@ def _repetition_lines(repetition: Repetition, cycle: UnlikeCycle, other: str) ->
     task = cycle.writer
     runs = " and ".join(repetition.runs)
     if repetition.attributes:
-        shown = _several(_values(attribute, other) for attribute in repetition.attributes)
-        yield f"before that cycle the state of '{task}' differed: {shown}"
+        attributes = _several(_values(attribute, other) for attribute in repetition.attributes)
+        yield f"before that cycle the state of '{task}' differed: {attributes}"
     else:
         yield f"before that cycle the state of '{task}' was equal, as far as it can be compared"
     if repetition.because == "chance":

@@ -195,8 +195,8 @@ def outcome_text(report: RunReport) -> Iterator[str]:
         yield ""
         yield f"Task {task['state']}: {done}{'; ' + task['reason'] if task['reason'] else ''}."
     for end in report.objects:
-        off = f"{end['off_mm']:.1f} mm from its goal (tolerance {end['tolerance_mm']:g} mm)"
-        yield f"Object {end['object']} ended {off}."
+        distance = f"{end['off_mm']:.1f} mm from its goal (tolerance {end['tolerance_mm']:g} mm)"
+        yield f"Object {end['object']} ended {distance}."
         for drop in end.get("drops", ()):
             yield f"Object {end['object']} fell {drop['mm']:.0f} mm at tick {drop['tick']}."
     if report.motion is not None:

@@ -100,5 +100,5 @@ def _again(run: Recording, cycle: UnlikeCycle, until: int) -> _Again:
                 # Serial and chain of the message that it wrote.
                 wrote = chains(rack.segment, until)[cycle.mailbox]
                 repetitions.append((wrote, tuple(unlike_in(run, rack.segment, until))))
-    wrote, unlike = repetitions[0]
-    return _Again(attributes, unlike, all(repetition == wrote for repetition, _ in repetitions))
+    wrote, differing = repetitions[0]
+    return _Again(attributes, differing, all(repetition == wrote for repetition, _ in repetitions))

@@ -198,15 +198,15 @@ def plan_ages_ms(recording: Recording, board: str) -> np.ndarray:
     See `plan_ages`.
     """
     plan = f"{board}.plan"
-    made = recording.signal(plan, "tick")
+    plan_ticks = recording.signal(plan, "tick")
     visible_at = recording.signal(plan, "visible_at")
     ticks = recording.trace(board)["tick"]
     cycle_stretches = recording.stretch_of(ticks)
-    plan_stretches = recording.stretch_of(made)
+    plan_stretches = recording.stretch_of(plan_ticks)
     ages = [
         plan_ages(
             ticks[cycle_stretches == stretch],
-            made[plan_stretches == stretch],
+            plan_ticks[plan_stretches == stretch],
             visible_at[plan_stretches == stretch],
         )
         for stretch in np.unique(plan_stretches)

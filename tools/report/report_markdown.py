@@ -132,9 +132,10 @@ def _state_tables(levels: dict[str, list[Document]]) -> TextTable:
     """Return a table with one line per level: its state table, and which rows fired."""
     rows = []
     for level, fired in levels.items():
-        most = max(fired, key=lambda row: row["cycles"])
+        most_frequent = max(fired, key=lambda row: row["cycles"])
         often, newest = (
-            f"{row['row']} {row['name']}, {row['first_s']:.2f} s" for row in (most, fired[-1])
+            f"{row['row']} {row['name']}, {row['first_s']:.2f} s"
+            for row in (most_frequent, fired[-1])
         )
         rows.append(
             {
@@ -282,8 +283,8 @@ def _response_along(response: Document) -> Blocks:
     yield TextTable(rows)
     for direction, measured in directions.items():
         if exceeding := measured["beyond"]:
-            most = _the_most(exceeding, "longest")
-            yield from ("", f"{direction}: {len(exceeding)} exceeded the bound{most}:")
+            selection = _the_most(exceeding, "longest")
+            yield from ("", f"{direction}: {len(exceeding)} exceeded the bound{selection}:")
         for slow in sorted(exceeding, key=lambda slow: -slow["ms"])[:SHOWN]:
             why = "; ".join(slow["delayed_by"]) or "no cause is recorded"
             yield f"- {slow['ms']:g} ms from tick {slow['tick']}: {why}"
@@ -306,7 +307,7 @@ def _interrupts(boards: Sequence[Document]) -> Iterator[str]:
     for board in boards:
         lost = f", {board['lost']} lost" if board["lost"] else ""
         latency = board["latency_us"]
-        took = (
+        latency_clause = (
             f"; {latency['p50']:g} us from sending to the end of service, at most"
             f" {latency['max']:g}"
             if latency
@@ -314,7 +315,7 @@ def _interrupts(boards: Sequence[Document]) -> Iterator[str]:
         )
         yield (
             f"Interrupts of {board['board']}: {board['served']} messages served, at most"
-            f" {board['waiting']} waiting, room for {board['depth']}{lost}{took}."
+            f" {board['waiting']} waiting, room for {board['depth']}{lost}{latency_clause}."
         )
 
 

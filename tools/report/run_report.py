@@ -72,8 +72,8 @@ class RunReport:
     @classmethod
     def of(cls, document: Document) -> RunReport:
         """Return a report from its plain data. Missing keys become None."""
-        known: Document = {field.name: document.get(field.name) for field in fields(cls)}
-        return cls(**known)
+        values: Document = {field.name: document.get(field.name) for field in fields(cls)}
+        return cls(**values)
 
     def document(self) -> Document:
         """Return the report as plain data."""

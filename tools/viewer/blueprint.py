@@ -107,8 +107,10 @@ def _all_and_each(
         shares: Heights of the racks and of that view.
     """
     columns = rrb.Horizontal(*(views.column(rack) for rack, views in racks.items()))
-    shown = rrb.Vertical(columns, below, row_shares=shares, name=name)
-    return rrb.Tabs(shown, *(views.everything(rack) for rack, views in racks.items()), active_tab=0)
+    first_tab = rrb.Vertical(columns, below, row_shares=shares, name=name)
+    return rrb.Tabs(
+        first_tab, *(views.everything(rack) for rack, views in racks.items()), active_tab=0
+    )
 
 
 def _log(racks: Mapping[str, RackViews], what: str) -> rrb.View:
@@ -217,13 +219,13 @@ class RackViews:
         error, *plots = (_curves(*curves) for curves in self.main_curves().items())
         views = [
             rrb.Tabs(
-                shown,
+                plot,
                 rrb.Grid(
                     *(self._joint(name, quantity) for name in self._joints),
                     name="by joint, with limits",
                 ),
             )
-            for shown, quantity in zip(plots, QUANTITIES, strict=True)
+            for plot, quantity in zip(plots, QUANTITIES, strict=True)
         ]
         other_plots = rrb.Tabs(
             *self._requests(), *self._forces(), error, *self._gripper(), active_tab=0
@@ -372,13 +374,13 @@ def _curves(
         overrides: Styles that replace those in the recording, by entity.
     """
     axis = rrb.TimeAxis(link="LinkToGlobal")
-    shown = rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=legend)
+    legend_style = rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=legend)
     return rrb.TimeSeriesView(
         origin="/",
         contents=contents,
         name=name,
         axis_x=axis,
-        plot_legend=shown,
+        plot_legend=legend_style,
         overrides=overrides,
     )
 

@@ -72,8 +72,8 @@ def joint_curves(
             if len(fields) == 1:
                 yield curves(stream, entity, values, labels, [colours[index]])
             else:
-                both = [COMMANDED, colours[index]]
-                yield curves(stream, entity, values, labels, both, OVERLAID)
+                shades = [COMMANDED, colours[index]]
+                yield curves(stream, entity, values, labels, shades, OVERLAID)
     labels = [f"{name}, mrad" for name in names]
     yield curves(
         stream,

@@ -34,7 +34,7 @@ def hand_curves(stream: Stream, names: Sequence[str], hand: Hand) -> Iterator[Vi
 
 
 def _finger_curves(
-    stream: Stream, names: Sequence[str], finger: str, at: int, joints: Ints
+    stream: Stream, names: Sequence[str], finger: str, finger_index: int, joints: Ints
 ) -> Iterator[ViewPart]:
     """Yield the parts that show one finger: joints, sensed and commanded tensions, and tip force.
 
@@ -42,7 +42,7 @@ def _finger_curves(
         stream: Where they are written.
         names: Names of all joints of the hand.
         finger: Name of the finger.
-        at: Index of the finger.
+        finger_index: Index of the finger.
         joints: Indices of its joints.
     """
     joint_names = [names[joint] for joint in joints]
@@ -69,14 +69,14 @@ def _finger_curves(
         stream,
         (HAND, finger, TENSIONS),
         stack_tensions,
-        [f"{tendon}{what}, N" for what in (" commanded", "") for tendon in tendons],
+        [f"{tendon}{suffix}, N" for suffix in (" commanded", "") for tendon in tendons],
         [COMMANDED] * len(tendons) + colours + [dimmed(colour) for colour in colours],
         np.repeat(OVERLAID, len(tendons)).tolist(),
     )
     yield curves(
         stream,
         (HAND, finger, FORCES),
-        lambda block: block.messages["force"][:, at],
+        lambda block: block.messages["force"][:, finger_index],
         [f"{axis}, N" for axis in "xyz"],
         of_joints(3),
     )

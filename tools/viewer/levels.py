@@ -181,8 +181,8 @@ class Hierarchy:
 def _names(rows: np.ndarray) -> np.ndarray:
     """Return the state of the level in each trace record, or "missed"."""
     names = np.array([state.name.lower() for state in State] + ["missed"])
-    shown = np.where(is_missed(rows), len(names) - 1, rows["state"])
-    return np.asarray(names[shown])
+    indices = np.where(is_missed(rows), len(names) - 1, rows["state"])
+    return np.asarray(names[indices])
 
 
 def positions(layout: Layout, rack: RackTiming) -> dict[str, tuple[float, float]]:

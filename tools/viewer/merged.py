@@ -57,10 +57,10 @@ def write_merged(
         stream = Stream(recording, Timelines(grid.clock_ns, grid.launch, place), roots[grid.rack])
         writer = RackWriter(stream, ran[grid.rack])
         last = grid.ticks[1] + 1
-        if kept := grid.recording.kept_text:
-            stream.say(Moment(0, grid.epoch_ns), "recorder", f"recorder: {kept}", "WARN")
+        if kept_text := grid.recording.kept_text:
+            stream.say(Moment(0, grid.epoch_ns), "recorder", f"recorder: {kept_text}", "WARN")
         for tick, rows in _blocks(grid.recording, last, block_of(grid.recording.layout)):
-            if kept and not rows:
+            if kept_text and not rows:
                 writer.skip(tick)
                 continue
             lost = grid.recording.lost if tick == last else {}
@@ -90,5 +90,5 @@ def _blocks(
     pieces = {
         name: np.split(rows, np.searchsorted(rows["tick"], borders)) for name, rows in rings.items()
     }
-    for at, tick in enumerate((*borders, last)):
-        yield tick, {name: rows[at] for name, rows in pieces.items() if len(rows[at])}
+    for index, tick in enumerate((*borders, last)):
+        yield tick, {name: rows[index] for name, rows in pieces.items() if len(rows[index])}

@@ -84,7 +84,7 @@ class Screen:
         Raises:
             KeyError: No view has that name.
         """
-        shown = None if view is None else self.views[view]
+        view_id = None if view is None else self.views[view]
         self._client.set_time(
             SIM_TIME, duration=np.timedelta64(round(at_s * 1e9), "ns"), play_state="paused"
         )
@@ -93,7 +93,7 @@ class Screen:
         while time.monotonic() < deadline:
             time.sleep(PAUSE_S)
             before = drawn
-            drawn = bytes(self._client.take_screenshot(shown))
+            drawn = bytes(self._client.take_screenshot(view_id))
             if drawn == before:
                 break
         return Look(drawn, tuple(self._complaints()))

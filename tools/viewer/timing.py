@@ -163,9 +163,9 @@ class Age:
     ) -> None:
         self._stream = stream
         self._lane = (AGES, mailbox.name)
-        own = TickGrid(mailbox.every, mailbox.phase)
+        own_grid = TickGrid(mailbox.every, mailbox.phase)
         self._releases = min(
-            [layout.read_grid(mailbox, reader) for reader in mailbox.readers], default=own
+            [layout.read_grid(mailbox, reader) for reader in mailbox.readers], default=own_grid
         )
         self._visible_at: Ints = np.empty(0, dtype=np.int64)
         self._made: Ints = np.empty(0, dtype=np.int64)

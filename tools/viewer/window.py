@@ -64,10 +64,10 @@ class ViewerWindow:
         if (status := self._process.wait()) == 0:
             return ""
         self._said.seek(0)
-        said = self._said.read().decode(errors="replace").strip().splitlines()
+        lines = self._said.read().decode(errors="replace").strip().splitlines()
         # A panic prints its cause before the trace.
-        panic = [line.partition(PANIC)[2] for line in said if PANIC in line]
-        return ": ".join([f"the viewer ended with status {status}", *(panic or said[-1:])[:1]])
+        panic = [line.partition(PANIC)[2] for line in lines if PANIC in line]
+        return ": ".join([f"the viewer ended with status {status}", *(panic or lines[-1:])[:1]])
 
     def ends_within(self, bound_s: float) -> bool:
         """Wait at most `bound_s` for the window to end. Returns True if it has."""
