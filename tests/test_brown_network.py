@@ -41,7 +41,7 @@ LAST = 2399
 """Simulated time of both racks together, and its last tick."""
 LOSS = ("peer_lost", "demand")
 """Codes of the events of a loss, and of the stop that it demands."""
-REFUSED = "in real time, on a network: only a run in lockstep is repeated"
+REFUSED = "it ran in real time on a network, but only lockstep runs can be repeated"
 HELD = "no reference from 'lan': held after 5 extrapolated"
 MOVING_RAD_S = 0.05
 MOST_S = 120.0

@@ -1,4 +1,4 @@
-"""Recordings with made-up traces, in the files that a recorder writes."""
+"""Recordings with synthetic traces, in the files that a recorder writes."""
 
 from __future__ import annotations
 
@@ -24,8 +24,10 @@ Row = tuple[int, ...]
 
 
 class Cycle(NamedTuple):
-    """One trace record, ms: `parts` are the stamped lengths of C, R, X, W; `processor` is None for
-    their sum."""
+    """One trace record, ms.
+
+    `parts` are the stamped lengths of C, R, X and W. `processor` is None for their sum.
+    """
 
     tick: int
     parts: tuple[float, float, float, float]
@@ -34,7 +36,7 @@ class Cycle(NamedTuple):
     flags: int = 0
 
     def row(self, period_ns: int) -> Row:
-        """Return the record; a tick takes `period_ns`."""
+        """Return the record, with ticks of `period_ns`."""
         release = self.tick * period_ns
         stamps = np.cumsum([round(ms * MS) for ms in (self.late, *self.parts)]) + release
         processor = sum(self.parts) if self.processor is None else self.processor
@@ -49,7 +51,7 @@ def cycle(
     skipped: int = 0,
     planned: bool = False,
 ) -> Row:
-    """Return a trace record released at `tick`; its moments, start to end, are us since tick 0."""
+    """Return a trace record released at `tick`, with its stamps in us since tick 0."""
     moments = [EPOCH_NS + moment * US for moment in moments_us]
     flags = skipped << SKIPPED_SHIFT | (skipped > 0) * Flag.SKIPPED | planned * Flag.PLANNED
     used = moments_us[-1] - moments_us[0] if processor_us is None else processor_us
@@ -63,8 +65,7 @@ def recorded(
     events: Sequence[Mapping[str, Any]] = (),
     messages: Mapping[str, np.ndarray] | None = None,
 ) -> Recording:
-    """Write the recording of a rack whose tasks left these traces, and messages, into `folder`;
-    return it."""
+    """Write the recording of a rack with these traces and messages into `folder`, and return it."""
     folder.mkdir(exist_ok=True)
     (folder / "config.toml").write_text(config.text())
     (folder / "events.jsonl").write_text("".join(checked_line({**event}) for event in events))

@@ -1,1 +1,1 @@
-"""The files of a run: written by the recorder process, and read by everyone else."""
+"""Files of a run, which the recorder process writes and all other tools read."""

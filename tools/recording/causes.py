@@ -1,11 +1,11 @@
-"""Why two runs diverge, as far as their recordings say: from a message that differs back to its
-cause.
+"""Finds the reason why two recorded runs diverge.
 
-Messages become visible at ticks, so the recording has all that a task had read at a release: what
-was visible until then. While some of that differs, the way goes back to who wrote it, and to an
-earlier cycle. It ends at a task whose inputs were equal: what befell that task (a fault, its death,
-a cycle missed) or its config differs, or else its code, or what its level remembers. The last two
-are in no recording: see `rack.tools.report.cycle_again`.
+Messages become visible at ticks, so a recording contains everything that a task had read at a
+release: all messages visible until that tick. Starting at the first message that differs, the
+search goes back through the inputs that differed, from cycle to earlier cycle. It ends at a task
+whose inputs were equal in both runs. The cause is then an event (a fault, a death, a missed cycle),
+a setting, the code of the level, or the state of the level. No recording contains the last two: see
+`rack.tools.report.cycle_again`.
 """
 
 from __future__ import annotations
@@ -34,15 +34,22 @@ EVENTS: Mapping[str | None, ClueKind] = {
     "command": "command",
     "demand": "demand",
 }
-"""Kinds of clues by the kinds of events, or a code, that are no consequence of messages."""
+"""Clue for each event kind or event code that does not follow from messages."""
 MISSED = {"late": "'{}' missed its deadline", "skipped": "'{}' skipped this cycle"}
 OWN = ("name", "record.", "clock.mode", "clock.speed", "fault", "command", "python_path")
-"""Keys of a config that no level's messages depend on, and those whose effects are events."""
+"""Prefixes of config keys that cannot cause a difference, or whose effects are recorded as events.
+"""
 
 
 @dataclass(frozen=True)
 class InBoth:
-    """A value that differs: in the run, and in the other one; None where there is none."""
+    """A value that differs between two runs.
+
+    Attributes:
+        name: Name of the field, setting or attribute.
+        here: Value in the first run, or None if that run has none.
+        there: Value in the other run, or None if that run has none.
+    """
 
     name: str
     here: Any
@@ -51,8 +58,14 @@ class InBoth:
 
 @dataclass(frozen=True)
 class Clue:
-    """What may be the cause: of `run` alone, or of both where that is empty; `tick` -1: from the
-    beginning.
+    """A possible cause of a difference.
+
+    Attributes:
+        kind: Kind of the clue.
+        text: The clue as a sentence for the user.
+        run: Folder of the run in which it happened, or "" if it applies to both.
+        tick: Tick at which it happened, or -1 if it applies from the start.
+        values: The setting that differs, for clues of kind "config".
     """
 
     kind: ClueKind
@@ -63,8 +76,12 @@ class Clue:
 
 
 class Told(NamedTuple):
-    """An event as a clue; `key` is equal for what happened alike in both runs, `about` names the
-    boards, tasks and mailboxes that it concerns.
+    """An event as a clue.
+
+    Attributes:
+        key: Identity of the event; equal for events that happened alike in both runs.
+        about: Boards, tasks and mailboxes that the event concerns.
+        clue: The clue.
     """
 
     key: tuple[str, ...]
@@ -74,10 +91,17 @@ class Told(NamedTuple):
 
 @dataclass(frozen=True)
 class UnlikeCycle:
-    """The cycle in which a task wrote the first message of a mailbox that differs.
+    """The cycle in which a task wrote the first differing message of a mailbox.
 
-    `fields` are those that differ in it. Of the mailboxes that the task had `read`, either all were
-    equal until then, or one was `unequal`: the next step back.
+    Attributes:
+        tick: Release tick of the cycle.
+        mailbox: The mailbox.
+        writer: The task that wrote the message.
+        fields: Fields of the message that differ.
+        read: Mailboxes that the task reads.
+        unequal: The mailbox among these that differed earliest before this cycle, which is the next
+            step back, or "" if all were equal.
+        clues: Possible causes in this cycle.
     """
 
     tick: int
@@ -90,65 +114,90 @@ class UnlikeCycle:
 
 
 class Divergence:
-    """Two runs that diverge, or do not; `unlike` are the first messages that differ, by mailbox,
-    the earliest first. Raises `Failure` as `unlike_messages` does.
+    """Comparison of two runs that finds their first differing messages and the causes.
+
+    Raises `Failure` in the same cases as `list_divergent_messages`.
+
+    Attributes:
+        runs: The two runs.
+        divergent: First differing message of each mailbox that differs, earliest first.
     """
 
-    def __init__(self, one: Recording, other: Recording) -> None:
-        self.runs = one, other
-        self.unlike = {unlike.mailbox: unlike for unlike in unlike_messages(one, other)}
-        self._begin, _ = common_ticks(one, other)
+    def __init__(self, first_run: Recording, second_run: Recording) -> None:
+        self.runs = first_run, second_run
+        self.unlike = {
+            message.mailbox: message for message in unlike_messages(first_run, second_run)
+        }
+        self._begin, _ = common_ticks(first_run, second_run)
 
     def chain(self, mailbox: str = "") -> tuple[UnlikeCycle, ...]:
-        """Return the cycles from the first message that differs, of all or of this mailbox, back to
-        the cause. Raises `Failure` for a mailbox that does not exist.
+        """Follow a difference back to its cause.
+
+        Args:
+            mailbox: Mailbox whose first difference is explained. Defaults to the one that differs
+                first.
+
+        Returns:
+            The cycles from the difference back to its cause. Empty if the mailbox does not differ.
+
+        Raises:
+            Failure: The mailbox does not exist.
         """
         if mailbox:
             mailbox_of(mailbox, self.runs[0].layout.timed)
         name = mailbox or next(iter(self.unlike), "")
-        found: dict[str, UnlikeCycle] = {}
-        # Messages that are visible at once may lead in a circle, within a tick.
-        while name in self.unlike and name not in found:
-            found[name] = self._cycle(self.unlike[name])
-            name = found[name].unequal
-        return tuple(found.values())
+        cycles: dict[str, UnlikeCycle] = {}
+        # Messages that become visible immediately can form a circle within one tick.
+        while name in self.unlike and name not in cycles:
+            cycles[name] = self._cycle(self.unlike[name])
+            name = cycles[name].unequal
+        return tuple(cycles.values())
 
-    def _cycle(self, unlike: UnlikeMessage) -> UnlikeCycle:
+    def _cycle(self, message: UnlikeMessage) -> UnlikeCycle:
+        """Describe the cycle that wrote a differing message: its inputs and possible causes."""
         layout = self.runs[0].layout
-        box = layout.mailbox(unlike.mailbox)
+        box = layout.mailbox(message.mailbox)
         read = [source for source in layout.timed if box.writer in source.readers]
-        unequal = [source.name for source in read if self._was_unequal(source, box.writer, unlike)]
+        unequal = [source.name for source in read if self._was_unequal(source, box.writer, message)]
         first = min(unequal, key=lambda name: self.unlike[name].tick, default="")
-        clues = [*self._events(box, unlike)]
+        clues = [*self._events(box, message)]
         if box.writer != CLOCK:
-            clues += self._missed(layout.task(box.writer), unlike.tick)
+            clues += self._missed(layout.task(box.writer), message.tick)
         if not first and box.writer != CLOCK:
             clues += [*self._config(box.writer), *self._outside(box.writer)]
         return UnlikeCycle(
-            tick=unlike.tick,
+            tick=message.tick,
             mailbox=box.name,
             writer=box.writer,
-            fields=tuple(self._fields(box, unlike.serial)),
+            fields=tuple(self._fields(box, message.serial)),
             read=tuple(source.name for source in read),
             unequal=first,
             clues=tuple(clues),
         )
 
-    def _was_unequal(self, source: MailboxSpec, reader: str, unlike: UnlikeMessage) -> bool:
-        """Say whether a task had read otherwise in a mailbox, until the cycle in which it wrote
-        otherwise.
+    def _was_unequal(self, source: MailboxSpec, reader: str, message: UnlikeMessage) -> bool:
+        """Return True if a task had read a differing message from a mailbox.
+
+        Only what was visible in the cycle that wrote the task's own differing message counts.
         """
-        found = self.unlike.get(source.name)
+        earlier = self.unlike.get(source.name)
         grid = self.runs[0].layout.read_grid(source, reader)
-        at = unlike.tick - (unlike.tick - grid.phase) % grid.every
-        return found is not None and found.visible_at <= at and found.mailbox != unlike.mailbox
+        release = message.tick - (message.tick - grid.phase) % grid.every
+        return (
+            earlier is not None
+            and earlier.visible_at <= release
+            and earlier.mailbox != message.mailbox
+        )
 
     def _fields(self, box: MailboxSpec, serial: int) -> Iterator[InBoth]:
-        """Yield what differs in a message."""
+        """Yield the fields of a message that differ.
+
+        If the messages come from different cycles, only "tick" is yielded.
+        """
         here, there = (row_of(run, box, serial) for run in self.runs)
         ticks = (None if row is None else int(row["tick"]) for row in (here, there))
         if here is None or there is None or here["tick"] != there["tick"]:
-            # These are messages of different cycles.
+            # The two messages come from different cycles, so their other fields say nothing.
             yield InBoth("tick", *ticks)
             return
         if here["visible_at"] != there["visible_at"]:
@@ -158,77 +207,86 @@ class Divergence:
         if here["basis"] != there["basis"]:
             yield InBoth("basis", int(here["basis"]), int(there["basis"]))
 
-    def _events(self, box: MailboxSpec, unlike: UnlikeMessage) -> Iterator[Clue]:
-        """Yield what befell the writer of a message, or the whole rack, in one of the runs only."""
+    def _events(self, box: MailboxSpec, message: UnlikeMessage) -> Iterator[Clue]:
+        """Yield events of only one run that concern the writer of a message or the whole rack."""
         boards = {name.partition(".")[0] for name in (box.writer, box.name)}
         about = {CLOCK, box.writer, box.name, *boards}
-        found = [list(self._told(run)) for run in self.runs]
-        for own, others, run in zip(found, reversed(found), self.runs, strict=True):
-            row = row_of(run, box, unlike.serial)
-            # A death is noticed when its messages are missing already, and perhaps none follows.
+        event_clues = [list(self._told(run)) for run in self.runs]
+        for this_run, other_run, run in zip(
+            event_clues, reversed(event_clues), self.runs, strict=True
+        ):
+            row = row_of(run, box, message.serial)
+            # A death is reported after the first message is missing, and perhaps none follows it.
             written = NEVER if row is None else int(row["tick"])
-            known = Counter(told.key for told in others)
-            for told in own:
-                # A level reads commands as messages of the clock.
-                if told.clue.kind == "command" and box.writer != CLOCK:
+            unmatched = Counter(event.key for event in other_run)
+            for event in this_run:
+                # A level reads commands as messages, so the comparison of its inputs covers them.
+                if event.clue.kind == "command" and box.writer != CLOCK:
                     continue
-                known[told.key] -= 1
-                until = written if told.clue.kind == "died" else unlike.tick
-                if known[told.key] < 0 and about & {*told.about} and told.clue.tick <= until:
-                    yield told.clue
+                unmatched[event.key] -= 1
+                until = written if event.clue.kind == "died" else message.tick
+                if unmatched[event.key] < 0 and about & {*event.about} and event.clue.tick <= until:
+                    yield event.clue
 
     def _told(self, run: Recording) -> Iterator[Told]:
-        """Yield what was done to a run, and the deaths in it, as its events say."""
+        """Yield the deaths and external interventions among a run's events."""
         for event in run.events:
             kind = EVENTS.get(event.get("code")) or EVENTS.get(event["kind"])
             if kind is not None and event["tick"] >= self._begin:
                 about = event["board"], event["subject"]
-                # The text of a death has the number of a process.
+                # The text of a death contains a process id, which always differs.
                 text = "" if kind == "died" else f"{event['tick']} {event['text']}"
                 clue = Clue(kind, event["text"], str(run.folder), event["tick"])
                 yield Told((kind, *about, text), about, clue)
 
     def _missed(self, task: TaskSpec, tick: int) -> Iterator[Clue]:
-        """Yield that a task was late with the cycle of this tick, or left it out, in one run."""
-        found = [
+        """Yield the miss of a task in the cycle of this tick, if only one of the runs has it."""
+        miss_clues = [
             Clue(miss["what"], MISSED[miss["what"]].format(task.name), str(run.folder), tick)
             for run in self.runs
             for miss in misses(run)
             if miss["task"] == task.name
             and miss["tick"] <= tick < miss["tick"] + miss["count"] * task.every
         ]
-        if len({clue.run for clue in found}) == 1:
-            yield from found
+        if len({clue.run for clue in miss_clues}) == 1:
+            yield from miss_clues
 
     def _config(self, task: str) -> Iterator[Clue]:
-        """Yield the keys of the writer's board that differ; if none does, those of the rack."""
+        """Yield the board's settings that differ, or the rack's if none of the board's do."""
         tables = (load_toml(run.config) for run in self.runs)
-        differ = [both for both in unlike_values(*tables) if not both.name.startswith(OWN)]
+        differences = [
+            difference
+            for difference in unlike_values(*tables)
+            if not difference.name.startswith(OWN)
+        ]
         board = f"board.{task.partition('.')[0]}."
-        own = [both for both in differ if both.name.startswith(board)]
-        for both in own or differ:
-            yield Clue("config", f"{both.name} differs", values=both)
+        of_board = [difference for difference in differences if difference.name.startswith(board)]
+        for difference in of_board or differences:
+            yield Clue("config", f"{difference.name} differs", values=difference)
 
     def _outside(self, task: str) -> Iterator[Clue]:
-        """Yield what a task reads that is in no recording."""
+        """Yield the inputs of a task that no recording contains."""
         layout = self.runs[0].layout
         hosts = {host.name for host in layout.hosts}
         for box in layout.mailboxes:
             if task in box.readers and box.writer in hosts:
-                text = f"{box.name}, of the host board '{box.writer}', is not recorded"
+                text = f"messages of the host board '{box.writer}' are not recorded: {box.name}"
                 yield Clue("outside", text)
         if task == LAN:
-            yield Clue("outside", "what comes from the network is not recorded")
+            yield Clue("outside", "messages from the network are not recorded")
 
 
 def _unlike_signal(signal: Signal, here: np.ndarray, there: np.ndarray) -> Iterator[InBoth]:
-    """Yield a field that differs in two messages, each (1,): of an array its first such number."""
+    """Yield a field if it differs between two messages, each of shape (1,).
+
+    Of an array field only the first differing number is yielded.
+    """
     values = [signal.values(message)[0] for message in (here, there)]
     if values[0].tobytes() == values[1].tobytes():
         return
     plain = [signal.plain(message)[0] for message in (here, there)]
     index = ""
-    # Zeros of either sign are equal, and differ: such an array is shown whole.
+    # 0.0 and -0.0 compare as equal but have different bytes: show the whole array.
     for place in np.argwhere(values[0] != values[1])[:1].tolist():
         index = "".join(f"[{number}]" for number in place)
         plain = [np.array(value, "O")[tuple(place)] for value in plain]
@@ -236,22 +294,22 @@ def _unlike_signal(signal: Signal, here: np.ndarray, there: np.ndarray) -> Itera
 
 
 def unlike_values(here: Mapping[str, Any], there: Mapping[str, Any]) -> Iterator[InBoth]:
-    """Yield the values that differ in two tables, by dotted names."""
-    own = dict(_dotted(here))
-    other = dict(_dotted(there))
-    for name in dict.fromkeys((*own, *other)):
-        if own.get(name) != other.get(name):
-            yield InBoth(name, own.get(name), other.get(name))
+    """Yield the values that differ between two nested tables, with dotted names."""
+    here_values = dict(_dotted(here))
+    there_values = dict(_dotted(there))
+    for name in dict.fromkeys((*here_values, *there_values)):
+        if here_values.get(name) != there_values.get(name):
+            yield InBoth(name, here_values.get(name), there_values.get(name))
 
 
-def _dotted(found: Mapping[str, Any], outer: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield values with those of tables in them, by dotted names; of lists of tables by number."""
-    for name, value in found.items():
+def _dotted(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the values of nested tables with dotted names. Lists of tables get an index."""
+    for name, value in table.items():
         is_tables = isinstance(value, list) and value and isinstance(value[0], dict)
         if isinstance(value, dict):
-            yield from _dotted(value, f"{outer}{name}.")
+            yield from _dotted(value, f"{prefix}{name}.")
         elif is_tables:
-            tables = {f"{name}[{at}]": table for at, table in enumerate(value)}
-            yield from _dotted(tables, outer)
+            tables = {f"{name}[{index}]": entry for index, entry in enumerate(value)}
+            yield from _dotted(tables, prefix)
         else:
-            yield f"{outer}{name}", value
+            yield f"{prefix}{name}", value

@@ -1,7 +1,7 @@
-"""Checksums of the files of a run, so that damage is named and never read as other values.
+"""Checksums of the files of a run, so that damage is reported and never read as other values.
 
-`checksums.xxh128` holds them as `xxh128sum -c checksums.xxh128` reads them. A run may be killed at
-any time, so each line of events.jsonl holds its own.
+`checksums.xxh128` has the format of `xxh128sum -c`. Because a run may be killed at any time, each
+line of events.jsonl also contains its own checksum.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from rack.tools.console.answer import Document, Failure, write_file
 
 CHECKSUMS = "checksums.xxh128"
 MOST_BYTES = 1 << 30
-"""Largest file of a run that is read into memory."""
+"""Size limit for files that are read into memory."""
 _LARGEST = 1 << 40
-"""Largest file of a run, in bytes."""
+"""Size limit for any file of a run, bytes."""
 _KEY = ', "check": "'
 _WHOLE = re.compile(_KEY + r'\w*"}')
 
 
 def read_file(path: Path) -> bytes:
-    """Return the content of a file of a run. Raises `Failure`."""
+    """Read a file of a run. Raises `Failure` if it is unreadable or no regular file."""
     try:
         return read_regular_file(path, MOST_BYTES)
     except OSError as error:
@@ -39,7 +39,7 @@ class Checksums:
     """The checksums of a run's files.
 
     Attributes:
-        stored: Checksum by path in the folder.
+        stored: Checksum of each file, by its path relative to the folder.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -48,13 +48,13 @@ class Checksums:
         path = folder / CHECKSUMS
         if path.is_symlink() or path.exists():
             lines = read_file(path).decode(errors="replace").splitlines()
-            found = [re.fullmatch(r"([0-9a-f]{32})  (.+)", line) for line in lines]
-            if None in found:
-                raise Failure(f"{path}: line {found.index(None) + 1} is damaged", 2)
-            self.stored = {match[2]: match[1] for match in found if match}
+            matches = [re.fullmatch(r"([0-9a-f]{32})  (.+)", line) for line in lines]
+            if None in matches:
+                raise Failure(f"{path}: line {matches.index(None) + 1} is damaged", 2)
+            self.stored = {match[2]: match[1] for match in matches if match}
 
     def store(self, *patterns: str) -> None:
-        """Store the checksums of the regular files that match a pattern. Raises `OSError`."""
+        """Store the checksums of all regular files that match a pattern. Raises `OSError`."""
         for path in (path for pattern in patterns for path in self._folder.glob(pattern)):
             if path.is_file():
                 self.stored[str(path.relative_to(self._folder))] = _digest(path)
@@ -62,16 +62,16 @@ class Checksums:
         write_file(self._folder / CHECKSUMS, text)
 
     def verify(self, *names: str) -> None:
-        """Raise `Failure` for the first of these files that has been damaged or changed."""
+        """Raise `Failure` for the first of these files that was damaged or changed."""
         for name in names:
             path = self._folder / name
             if _digest(path) != self.stored.get(name):
-                why = f"damaged, or changed later: its checksum is not the one in {CHECKSUMS}"
+                why = f"damaged, or changed later: its checksum differs from {CHECKSUMS}"
                 raise Failure(f"{path}: {why}", 2)
 
 
 def check_file(path: Path) -> None:
-    """Raise `Failure` for a file of a run that is not there, or is no regular file."""
+    """Raise `Failure` if a file of a run is missing or no regular file."""
     try:
         check_regular_file(path, _LARGEST)
     except OSError as error:
@@ -79,22 +79,23 @@ def check_file(path: Path) -> None:
 
 
 def _digest(path: Path) -> str:
+    """Return the checksum of a file as hexadecimal digits."""
     check_file(path)
     with path.open("rb") as file:
         return file_digest(file, xxh3_128).hexdigest()
 
 
 def checked_line(entry: Document) -> str:
-    """Return an entry of events.jsonl as a line that holds its own checksum."""
+    """Format an entry of events.jsonl as a line with its own checksum."""
     text = encode_json(entry)
     return f'{text[:-1]}{_KEY}{xxh3_64_hexdigest(text.encode())}"}}\n'
 
 
 def read_line(line: str) -> Document:
-    """Return the entry in a line of events.jsonl.
+    """Parse a line of events.jsonl.
 
     Raises:
-        ValueError: The line is damaged, or not JSON.
+        ValueError: The line is damaged or not JSON.
     """
     text, _, check = line.removesuffix("\n").rpartition(_KEY)
     text += "}"
@@ -108,5 +109,5 @@ def read_line(line: str) -> Document:
 
 
 def is_cut_off(line: str) -> bool:
-    """Return whether a last line without an end is what a killed run leaves."""
+    """Return True if an unterminated last line has no checksum, as when the run was killed."""
     return not _WHOLE.search(line)

@@ -1,7 +1,7 @@
-"""What the machine did to its cores during a run, apart from our own lateness.
+"""Measures what the machine did to its cores during a run.
 
-Steal is time during which the hypervisor held a core that this machine needed; /proc/stat counts it
-by core. A core that runs at a lower frequency computes longer; cpufreq shows it, or else
+Steal is time for which the hypervisor withheld a core that this machine needed; /proc/stat counts
+it for each core. A core at a lower frequency computes more slowly; cpufreq shows the frequency, or
 /proc/cpuinfo where it has the field.
 """
 
@@ -24,15 +24,16 @@ STAT = Path("/proc/stat")
 CPUINFO = Path("/proc/cpuinfo")
 CPUFREQ = Path("/sys/devices/system/cpu")
 STEAL = 8
-"""Column of a core's line."""
+"""Column of the steal count in a core's line of /proc/stat."""
 FREQUENCY_S = 0.5
-"""Time between two looks at the frequency: some kernels interrupt every core for an answer."""
+"""Time between two readings of the frequency, because some kernels interrupt every core for it."""
 _MS = 1000 // os.sysconf("SC_CLK_TCK")
 
 
 class Stolen(NamedTuple):
-    """Time stolen from a core between two looks (CLOCK_MONOTONIC); the kernel counts in steps of 10
-    ms.
+    """Time stolen from a core between two readings, in CLOCK_MONOTONIC.
+
+    The kernel counts in steps of 10 ms.
     """
 
     from_ns: int
@@ -43,10 +44,12 @@ class Stolen(NamedTuple):
 
 @dataclass(frozen=True)
 class CoreRecord:
-    """What was seen in `lasted_ns`: the rises of steal, earliest first, and lowest and highest MHz
-    by core.
+    """Measurements of a `CoreMeter`.
 
-    `stolen` is None where steal was not measured; a core without a frequency is not in `mhz`.
+    Attributes:
+        lasted_ns: Duration of the measurement.
+        stolen: Increases of steal, earliest first, or None if steal was not measured.
+        mhz: Core, lowest and highest MHz, for cores with a known frequency.
     """
 
     lasted_ns: int = 0
@@ -54,16 +57,16 @@ class CoreRecord:
     mhz: tuple[tuple[int, float, float], ...] = ()
 
     def text(self) -> str:
-        """Return it as JSON."""
+        """Return the record as JSON."""
         return encode_json(asdict(self))
 
     @classmethod
     def of(cls, text: str | bytes) -> Self:
-        """Return the record in JSON. Raises `ValueError` for anything else."""
+        """Parse the JSON of a record. Raises `ValueError` for any other text."""
         return TypeAdapter(cls).validate_json(text)
 
     def stolen_ms(self) -> dict[int, int]:
-        """Return the time stolen by core; cores that lost none are left out."""
+        """Return the stolen time by core. Cores without steal are left out."""
         spans = self.stolen or ()
         return {
             core: sum(s.ms for s in spans if s.core == core)
@@ -72,11 +75,11 @@ class CoreRecord:
 
 
 UNMEASURED = CoreRecord()
-"""Nothing was measured."""
+"""Record of a run in which nothing was measured."""
 
 
 class CoreMeter:
-    """Reads the counters now and then; `record` has what they showed."""
+    """Measures steal and frequency of the cores by reading the kernel's counters repeatedly."""
 
     def __init__(self) -> None:
         self._stolen: list[Stolen] = []
@@ -86,7 +89,7 @@ class CoreMeter:
         self._frequency_at = 0.0
 
     def look(self) -> None:
-        """Compare the counters with those of the last look."""
+        """Read the counters and note what changed since the last reading."""
         counts = _counts()
         now = time.monotonic_ns()
         if counts != self._counts:
@@ -105,7 +108,7 @@ class CoreMeter:
                 self._mhz[core] = min(low, mhz), max(high, mhz)
 
     def record(self) -> CoreRecord:
-        """Return what was seen up to the last look."""
+        """Return what was measured up to the last reading."""
         mhz = tuple((core, low, high) for core, (low, high) in sorted(self._mhz.items()))
         return CoreRecord(
             self._looked_ns - self._began_ns, tuple(self._stolen) if self._counts else None, mhz
@@ -113,7 +116,7 @@ class CoreMeter:
 
 
 def _counts() -> dict[int, int]:
-    """Return steal by core, in the kernel's ticks; empty where the kernel does not count it."""
+    """Return the steal of each core in kernel ticks, or {} where the kernel does not count it."""
     lines = [line.split() for line in STAT.read_text().splitlines()]
     return {
         int(line[0].removeprefix("cpu")): int(line[STEAL])
@@ -123,13 +126,13 @@ def _counts() -> dict[int, int]:
 
 
 def _frequencies() -> Iterator[tuple[int, float]]:
-    """Yield core and MHz; nothing where the machine does not show them."""
-    found = sorted(CPUFREQ.glob("cpu[0-9]*/cpufreq/scaling_cur_freq"))
-    # A core that has been switched off has no readable frequency.
-    for path in found:
+    """Yield cores and their MHz, as far as the machine shows them."""
+    frequency_files = sorted(CPUFREQ.glob("cpu[0-9]*/cpufreq/scaling_cur_freq"))
+    # An offline core has no readable frequency.
+    for path in frequency_files:
         with suppress(OSError, ValueError):
             yield int(path.parts[-3].removeprefix("cpu")), int(path.read_text()) / 1000
-    for block in () if found else CPUINFO.read_text().split("\n\n"):
+    for block in () if frequency_files else CPUINFO.read_text().split("\n\n"):
         fields = {
             name.strip(): value
             for name, _, value in (line.partition(":") for line in block.splitlines())

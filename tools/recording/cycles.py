@@ -1,4 +1,4 @@
-"""The cycles of a run, unit function by unit function, and the budgets that they amount to."""
+"""The measured cycles of a run, split into unit functions, and the budgets that they need."""
 
 from __future__ import annotations
 
@@ -16,24 +16,32 @@ from rack.tools.recording.stalls import stalls_of
 START_UP_S = 0.1
 """Simulated time after the start of a process in which its cycles are not judged.
 
-It touches its memory for the first time and fills its caches: the first cycle of each level of the
-default rack takes 2 to 8 times as long as usual; from the sixth on they are alike.
+A new process touches its memory for the first time and fills its caches. The first cycle of each
+level of the default rack takes 2 to 8 times as long as usual; the sixth takes the usual time.
 """
 WORST = 100.0
-"""The percentile of eq. 3.6: the longest of all cycles."""
+"""Percentile that eq. 3.6 demands: the longest of all cycles."""
 
 
 @dataclass(frozen=True)
 class Cycles:
-    """The cycles of one task, oldest first; of a planner only those that made a plan.
+    """The cycles of one task, oldest first. Of a planner only those that produced a plan.
 
-    `rows` are the trace records, shape (n,). Processor times, ns, shape (n,): `exchange_ns`, C,
-    reading the plan, 0 of a planner; `read_ns`, R, reading commands and statuses; `process_ns`, X
-    or P; `write_ns`, W or U. `is_judged` excludes the start-up of a process, and the `stalled`
-    cycles: those in which the core may have been away (see `stalls_of`); bool, shape (n,). `core`
-    and `priority` are those that the task obtained; `overhead_ns` is the processor time of a cycle
-    outside its parts, for waking up and closing it. `stretches` are those of the recording, shape
-    (n,), see `Recording.stretch_of`.
+    All arrays have shape (n,), and all times are processor times.
+
+    Attributes:
+        task: The task.
+        core: Core that the task ran on.
+        priority: Priority that the task obtained.
+        rows: Trace records.
+        exchange_ns: C, time to read the plan. 0 for a planner.
+        read_ns: R, time to read commands and statuses.
+        process_ns: X of an executor, P of a planner.
+        write_ns: W of an executor, U of a planner.
+        is_judged: False for cycles of a process's start-up and for stalled cycles.
+        stalled: Number of cycles in which the core may have been away, see `analyze_stalls`.
+        overhead_ns: Time per cycle outside these parts, for waking up and closing the cycle.
+        stretches: Stretch of the recording that contains the cycle, see `find_stretches`.
     """
 
     task: TaskSpec
@@ -51,39 +59,43 @@ class Cycles:
 
     @property
     def communication_ns(self) -> np.ndarray:
-        """t_comm of an executor: C, R and W, shape (n,)."""
+        """t_comm of an executor: the sum of C, R and W, shape (n,)."""
         return np.asarray(self.exchange_ns + self.read_ns + self.write_ns)
 
     @property
     def used_ns(self) -> np.ndarray:
-        """All parts together, shape (n,)."""
+        """Sum of all parts, shape (n,)."""
         return np.asarray(self.communication_ns + self.process_ns)
 
 
 def cycles_of(recording: Recording) -> dict[str, Cycles]:
-    """Return the cycles of a run by task; tasks without any are left out."""
+    """Return the cycles of a run by task. Tasks without recorded cycles are left out."""
     tasks = [task for task in recording.layout.tasks if len(recording.cycles.get(task.name, ()))]
     places = {task.name: recording.place(task) for task in tasks}
-    _, away = stalls_of(recording)
+    _, absent = stalls_of(recording)
     spans = {task.name: Occupation.of(recording.cycles[task.name]) for task in tasks}
-    planned = {task.name for task in recording.layout.tasks if task.role == "planner"}
-    found = {}
+    with_planner = {task.name for task in recording.layout.tasks if task.role == "planner"}
+    by_task = {}
     for task in tasks:
         core, priority = places[task.name]
-        above = [name for name, (on, at) in places.items() if on == core and at > priority]
+        higher_priority = [
+            name
+            for name, (other_core, other_priority) in places.items()
+            if other_core == core and other_priority > priority
+        ]
         rows = recording.cycles[task.name]
         rows = plans(rows) if task.role == "planner" else rows
         if len(rows):
-            above_it = Occupation.union([spans[name] for name in above])
-            exchange_ns, read_ns, process_ns, write_ns = unit_times(rows, above_it).T
-            if task.role == "executor" and f"{task.name}.planner" not in planned:
-                # Without a planner the look for a plan is part of reading.
+            preempted_by = Occupation.union([spans[name] for name in higher_priority])
+            exchange_ns, read_ns, process_ns, write_ns = unit_times(rows, preempted_by).T
+            if task.role == "executor" and f"{task.name}.planner" not in with_planner:
+                # Without a planner, the check for a new plan counts as reading.
                 read_ns = read_ns + exchange_ns
                 exchange_ns = np.zeros_like(read_ns)
             settled = _settled(recording, task.name, rows["tick"])
-            whole = settled & (away[core].within(rows["start_ns"], rows["end_ns"]) == 0)
-            judged = whole if whole.any() else settled
-            found[task.name] = Cycles(
+            undisturbed = settled & (absent[core].within(rows["start_ns"], rows["end_ns"]) == 0)
+            judged = undisturbed if undisturbed.any() else settled
+            by_task[task.name] = Cycles(
                 task=task,
                 core=core,
                 priority=priority,
@@ -97,68 +109,79 @@ def cycles_of(recording: Recording) -> dict[str, Cycles]:
                 overhead_ns=overhead_ns(rows),
                 stretches=recording.stretch_of(rows["tick"]),
             )
-    return found
+    return by_task
 
 
 def _settled(recording: Recording, task: str, ticks: np.ndarray) -> np.ndarray:
-    """Return which cycles do not belong to the start-up of a process; all where none would be
-    left.
-    """
+    """Return which cycles lie outside the start-up of a process, or all if none do."""
     span = round(START_UP_S * 1e9 / recording.layout.clock_ns)
     settled = np.ones(len(ticks), bool)
-    for begun in (0, *restarts(recording).get(task, ())):
-        settled &= (ticks < begun) | (ticks >= begun + span)
+    for start_tick in (0, *restarts(recording).get(task, ())):
+        settled &= (ticks < start_tick) | (ticks >= start_tick + span)
     return settled if settled.any() else np.ones(len(ticks), bool)
 
 
 def restarts(recording: Recording) -> dict[str, list[int]]:
-    """Return by task the ticks at which a new process of it rejoined."""
-    found: dict[str, list[int]] = {}
+    """Return, by task, the ticks at which a restarted process of it rejoined."""
+    rejoin_ticks: dict[str, list[int]] = {}
     for event in recording.events:
         if event.get("code") == "rejoined":
-            found.setdefault(event["board"], []).append(event["tick"])
-    return found
+            rejoin_ticks.setdefault(event["board"], []).append(event["tick"])
+    return rejoin_ticks
 
 
 def measured_budgets(recording: Recording, percentile: float = WORST) -> dict[str, Budget]:
-    """Return the processor time that each level of a run took, by board; levels that never ran are
-    left out.
+    """Return the processor time that each level of a run needed, by board.
 
-    Each part is the longest of all cycles (eq. 3.6), whether or not they fell into the same one;
-    with a `percentile` below 100, the longest of that many in a hundred. The start-up of processes
-    (`START_UP_S`) is excluded, and so are cycles with a stall in them: a virtual machine stalled by
-    its host counts that as processor time.
+    Each part is the longest of all cycles (eq. 3.6), and the parts may come from different cycles.
+    Cycles of a process's start-up (`START_UP_S`) are excluded. So are stalled cycles, because a
+    virtual machine counts the time of a stall as processor time.
+
+    Args:
+        recording: The run.
+        percentile: Percentage of the cycles that must fit into the budget.
+
+    Returns:
+        Budgets by board. Levels that never ran are left out.
     """
     return budgets_of(cycles_of(recording), percentile)
 
 
-def budgets_of(found: Mapping[str, Cycles], percentile: float) -> dict[str, Budget]:
-    """Return the budgets, by board, of cycles from `cycles_of`."""
-    executors = {name: cycles for name, cycles in found.items() if cycles.task.role == "executor"}
+def budgets_of(cycles_by_task: Mapping[str, Cycles], percentile: float) -> dict[str, Budget]:
+    """Return the budgets, by board, of cycles from `measure_cycles`."""
+    executors = {
+        name: cycles for name, cycles in cycles_by_task.items() if cycles.task.role == "executor"
+    }
     return {
-        cycles.task.board: _budget(cycles, found.get(f"{name}.planner"), percentile)
+        cycles.task.board: _budget(cycles, cycles_by_task.get(f"{name}.planner"), percentile)
         for name, cycles in executors.items()
     }
 
 
 def _budget(executor: Cycles, planner: Cycles | None, percentile: float) -> Budget:
-    def worst(cycles: Cycles, times_ns: np.ndarray) -> int:
+    """Return the budget of one level."""
+
+    def worst_time(cycles: Cycles, times_ns: np.ndarray) -> int:
+        """Return the percentile of the times of all judged cycles."""
         return worst_of(times_ns[cycles.is_judged], percentile)
 
-    of_plan = {}
+    planner_parts = {}
     if planner is not None:
-        # P includes reading the planner's inputs.
-        of_plan["plan_ns"] = worst(planner, planner.read_ns + planner.process_ns)
-        of_plan["update_ns"] = worst(planner, planner.write_ns)
+        # P includes reading the inputs of the planner.
+        planner_parts["plan_ns"] = worst_time(planner, planner.read_ns + planner.process_ns)
+        planner_parts["update_ns"] = worst_time(planner, planner.write_ns)
     return Budget(
-        read_ns=worst(executor, executor.read_ns),
-        process_ns=worst(executor, executor.process_ns),
-        write_ns=worst(executor, executor.write_ns),
-        exchange_ns=worst(executor, executor.exchange_ns),
-        **of_plan,
+        read_ns=worst_time(executor, executor.read_ns),
+        process_ns=worst_time(executor, executor.process_ns),
+        write_ns=worst_time(executor, executor.write_ns),
+        exchange_ns=worst_time(executor, executor.exchange_ns),
+        **planner_parts,
     )
 
 
 def worst_of(times_ns: np.ndarray, percentile: float = WORST) -> int:
-    """Return a percentile of times, shape (n,), as a time that was measured; 0 of none."""
+    """Return the smallest measured time that covers a percentile of the times, shape (n,).
+
+    Returns 0 if there are no times.
+    """
     return int(np.percentile(times_ns, percentile, method="higher")) if len(times_ns) else 0

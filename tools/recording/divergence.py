@@ -1,4 +1,4 @@
-"""Where two runs diverge: of each mailbox the first message that is not the same in both."""
+"""Finds the first message of each mailbox that differs between two runs."""
 
 from __future__ import annotations
 
@@ -16,15 +16,17 @@ from rack.tools.recording.origin import Origin
 from rack.tools.recording.recording import Recording
 
 HEADS = ("serial", "tick", "visible_at", "chain")
-"""Columns by which messages are compared: the chain of each covers all that was written before
-it."""
+"""Columns that are compared. The chain of a message covers everything written before it."""
 Heads = Mapping[str, np.ndarray]
 
 
 @dataclass(frozen=True)
 class Difference:
-    """Where two runs diverge: the release tick of the first message that differs, and its
-    mailbox.
+    """The first difference between two runs.
+
+    Attributes:
+        tick: Release tick of the cycle that wrote the first differing message.
+        mailbox: Mailbox of that message.
     """
 
     tick: int
@@ -33,10 +35,15 @@ class Difference:
 
 @dataclass(frozen=True)
 class UnlikeMessage:
-    """The first message of a mailbox that is not the same in two runs.
+    """The first message of a mailbox that differs between two runs.
 
-    `tick` is that of the cycle that wrote it, `visible_at` the tick from which it is read: where
-    they differ, or one run lacks the message, the earlier one.
+    If the ticks differ, or one run lacks the message, the earlier tick counts.
+
+    Attributes:
+        mailbox: The mailbox.
+        serial: Serial of the message.
+        tick: Release tick of the cycle that wrote it.
+        visible_at: Tick from which it can be read.
     """
 
     mailbox: str
@@ -46,67 +53,80 @@ class UnlikeMessage:
 
 
 def other_run(run: Path, named: Path, asked: str = "") -> Path:
-    """Return the folder of the run that one is compared with: the one `named` or, for "origin", the
-    one that it goes on from, where its user named it or next to it. Raises `Failure`, which begins
-    with what was `asked`.
+    """Return the folder of the run with which `run` is to be compared.
+
+    Args:
+        run: Folder of the run.
+        named: Folder of the other run, or "origin" for the run that `run` continues. That one is
+            looked for at its recorded path, then next to `run`.
+        asked: What the user asked for. Begins the message of a `Failure`.
+
+    Raises:
+        Failure: The run continues no other run, or that run no longer exists.
     """
     if str(named) != "origin":
         return named
     asked = f"{asked or '--against origin'}: {run}"
     origin = Origin.of(Recording(run))
     if origin is None:
-        raise Failure(f"{asked} records no run that it goes on from; permitted: --against RUN", 2)
-    there = Path(origin.folder)
-    for folder in (there, run.resolve().parent / there.name):
+        raise Failure(f"{asked} does not continue another run; name one with --against RUN", 2)
+    origin_folder = Path(origin.folder)
+    for folder in (origin_folder, run.resolve().parent / origin_folder.name):
         if (folder / CONFIG).is_file() and origin.is_of(Recording(folder)):
             return folder
-    raise Failure(f"{asked} goes on from {there}, and that run is not there any more", 2)
+    raise Failure(f"{asked} continues {origin_folder}, but that run no longer exists", 2)
 
 
-def first_difference(one: Recording, other: Recording) -> Difference | None:
-    """Return where two runs diverge, up to the end of the shorter one; None when all that both
-    wrote is equal. Raises `Failure` as `unlike_messages` does.
+def first_difference(first_run: Recording, second_run: Recording) -> Difference | None:
+    """Return where two runs diverge, or None if everything that both wrote is equal.
+
+    Only ticks up to the end of the shorter run count. Raises `Failure` in the same cases as
+    `list_divergent_messages`.
     """
-    found = unlike_messages(one, other)
-    return Difference(found[0].tick, found[0].mailbox) if found else None
+    messages = unlike_messages(first_run, second_run)
+    return Difference(messages[0].tick, messages[0].mailbox) if messages else None
 
 
-def unlike_messages(one: Recording, other: Recording) -> list[UnlikeMessage]:
-    """Return of each mailbox the first message that differs, if any, in the order of ticks.
+def unlike_messages(first_run: Recording, second_run: Recording) -> list[UnlikeMessage]:
+    """Return the first differing message of each mailbox, if any, sorted by tick.
 
-    Raises `Failure` when the two runs are of different racks, or either lacks rows.
+    Raises:
+        Failure: The runs are of different racks, or one of them lacks rows.
     """
-    for run in (one, other):
+    for run in (first_run, second_run):
         _check_whole(run)
-    _check_alike(one, other)
-    begin, end = common_ticks(one, other)
-    written = {*one.mailboxes, *other.mailboxes}
-    boxes = {box.name for box in other.layout.timed} & written
-    found = [
+    _check_alike(first_run, second_run)
+    begin, end = common_ticks(first_run, second_run)
+    written = {*first_run.mailboxes, *second_run.mailboxes}
+    boxes = {box.name for box in second_run.layout.timed} & written
+    messages = [
         unlike
-        for box in one.layout.timed
-        if box.name in boxes and (unlike := _unlike(one, other, box, begin, end)) is not None
+        for box in first_run.layout.timed
+        if box.name in boxes
+        and (unlike := _unlike(first_run, second_run, box, begin, end)) is not None
     ]
-    return sorted(found, key=lambda unlike: unlike.tick)
+    return sorted(messages, key=lambda unlike: unlike.tick)
 
 
 def ticks_of(recording: Recording) -> tuple[int, int]:
     """Return the ticks of a recorded run, [first, end)."""
-    found = [rows["tick"] for rows in recording.cycles.values()]
+    ticks_by_task = [rows["tick"] for rows in recording.cycles.values()]
     end: int = recording.ended.get("outcome", {}).get("ticks", 0)
-    end = end or max((int(ticks[-1]) + 1 for ticks in found), default=0)
-    return min((int(ticks[0]) for ticks in found), default=0), end
+    end = end or max((int(ticks[-1]) + 1 for ticks in ticks_by_task), default=0)
+    return min((int(ticks[0]) for ticks in ticks_by_task), default=0), end
 
 
-def common_ticks(one: Recording, other: Recording) -> tuple[int, int]:
-    """Return the ticks that two runs have in common, [first, end): one that goes on from another
-    begins later.
+def common_ticks(first_run: Recording, second_run: Recording) -> tuple[int, int]:
+    """Return the ticks that two runs have in common, [first, end).
+
+    A run that continues another one begins later.
     """
-    begins, ends = zip(ticks_of(one), ticks_of(other), strict=True)
+    begins, ends = zip(ticks_of(first_run), ticks_of(second_run), strict=True)
     return max(begins), min(ends)
 
 
 def _check_whole(recording: Recording) -> None:
+    """Raise `Failure` if a recording lacks rows."""
     if recording.kept:
         why = recording.kept_text
     elif lost := sum(recording.lost.values()):
@@ -116,67 +136,78 @@ def _check_whole(recording: Recording) -> None:
     raise Failure(f"{recording.folder}: {why}; the two runs cannot be compared", 2)
 
 
-def _check_alike(one: Recording, other: Recording) -> None:
-    both = f"{one.folder} and {other.folder}"
-    boards, others = ([task.board for task in run.layout.tasks] for run in (one, other))
-    # A rack may have a board more, as one that watches.
+def _check_alike(first_run: Recording, second_run: Recording) -> None:
+    """Raise `Failure` if two runs are of racks that cannot be compared."""
+    both = f"{first_run.folder} and {second_run.folder}"
+    boards, others = ([task.board for task in run.layout.tasks] for run in (first_run, second_run))
+    # One rack may have additional boards, for example a watching one.
     if not ({*boards} <= {*others} or {*others} <= {*boards}):
-        lone = next(board for board in boards if board not in others)
-        raise Failure(f"{both} are of different racks: only the first has '{lone}'", 2)
-    boxes = {box.name: box for box in other.layout.timed}
-    for box in one.layout.timed:
+        extra_board = next(board for board in boards if board not in others)
+        raise Failure(f"{both} are of different racks: only the first has '{extra_board}'", 2)
+    boxes = {box.name: box for box in second_run.layout.timed}
+    for box in first_run.layout.timed:
         if box.name in boxes and box.fields != boxes[box.name].fields:
             raise Failure(f"{both} are of different racks: {box.name} has other fields", 2)
-    if not {*one.mailboxes} & {*other.mailboxes}:
+    if not {*first_run.mailboxes} & {*second_run.mailboxes}:
         raise Failure(f"{both} have no mailbox in common", 2)
 
 
 def _unlike(
-    one: Recording, other: Recording, box: MailboxSpec, begin: int, end: int
+    first_run: Recording, second_run: Recording, box: MailboxSpec, begin: int, end: int
 ) -> UnlikeMessage | None:
-    heads = [_heads(run, box.name, begin) for run in (one, other)]
+    """Return the first differing message of a mailbox from tick `begin` on, or None.
+
+    The serials show where a message is missing, because a damaged message is in no recording. A
+    difference in the content of a message shows in the chain of the message after it.
+    """
+    heads = [_heads(run, box.name, begin) for run in (first_run, second_run)]
     length = min(len(head["serial"]) for head in heads)
-    apart, chained = (
+    first_serial_difference, first_chain_difference = (
         next(iter(np.flatnonzero(here[:length] != there[:length]).tolist()), length)
         for here, there in ((heads[0][name], heads[1][name]) for name in ("serial", "chain"))
     )
-    # A damaged message is in no recording: the serials are apart where it was. Of any other the
-    # chain shows a difference one message later.
-    first = apart if apart <= chained else max(chained - 1, 0)
-    if first == length > 0 and not _is_last_equal(one, other, box, heads):
+
+    first = (
+        first_serial_difference
+        if first_serial_difference <= first_chain_difference
+        else max(first_chain_difference - 1, 0)
+    )
+    if first == length > 0 and not _is_last_equal(first_run, second_run, box, heads):
         first -= 1
-    found = [
+    positions = [
         tuple(int(head[name][first]) for name in HEADS[:-1])
         for head in heads
         if first < len(head["serial"])
     ]
-    if not found:
+    if not positions:
         return None
-    serial, tick, visible_at = (min(numbers) for numbers in zip(*found, strict=True))
-    # The other run may have ended before it would have written that message.
-    if len(found) == 1 and visible_at >= end:
+    serial, tick, visible_at = (min(numbers) for numbers in zip(*positions, strict=True))
+    # The other run may have ended before it could write that message.
+    if len(positions) == 1 and visible_at >= end:
         return None
     return UnlikeMessage(box.name, serial, tick, visible_at)
 
 
 def _heads(run: Recording, mailbox: str, begin: int) -> Heads:
-    """Return the heads of the messages written from tick `begin` on."""
+    """Return the compared columns of the messages written from tick `begin` on."""
     columns = {name: run.signal(mailbox, name) for name in HEADS}
     is_later = columns["tick"] >= begin
     return {name: values[is_later] for name, values in columns.items()}
 
 
-def _is_last_equal(one: Recording, other: Recording, box: MailboxSpec, heads: list[Heads]) -> bool:
-    """Say whether the last message that both have is equal: no chain covers it yet."""
-    at = min(len(head["serial"]) for head in heads) - 1
-    if any(heads[0][name][at] != heads[1][name][at] for name in HEADS):
+def _is_last_equal(
+    first_run: Recording, second_run: Recording, box: MailboxSpec, heads: list[Heads]
+) -> bool:
+    """Return True if the last message that both runs have is equal. No chain covers it yet."""
+    last = min(len(head["serial"]) for head in heads) - 1
+    if any(heads[0][name][last] != heads[1][name][last] for name in HEADS):
         return False
-    found = (row_of(run, box, int(heads[0]["serial"][at])) for run in (one, other))
-    return len({row["message"].tobytes() for row in found}) == 1
+    rows = (row_of(run, box, int(heads[0]["serial"][last])) for run in (first_run, second_run))
+    return len({row["message"].tobytes() for row in rows}) == 1
 
 
 def row_of(run: Recording, box: MailboxSpec, serial: int) -> Any:
-    """Return the row of a message; None where the recording has none of that serial."""
+    """Return the row of a message, or None if the recording has no message of that serial."""
     rows = run.rows(box.name)
-    at = np.flatnonzero(rows["serial"] == serial)
-    return rows[at[0]] if len(at) else None
+    matches = np.flatnonzero(rows["serial"] == serial)
+    return rows[matches[0]] if len(matches) else None

@@ -1,5 +1,7 @@
-"""What entered a recorded run from outside, so that it can be repeated: through its adapters, for a
-replay without host boards and other racks, and from its operators.
+"""The external inputs of a recorded run, with which it can be repeated.
+
+These are the messages that came in through adapters, for a replay without host boards and other
+racks, and the commands of operators.
 """
 
 from __future__ import annotations
@@ -22,73 +24,102 @@ from rack.tools.recording.recording import Recording
 
 
 def recorded_entries(config: RackConfig, run: Path, asked: str = "") -> dict[str, Entries]:
-    """Return what each adapter of a config wrote in the run in folder `run`, by adapter and port.
+    """Load the messages that each adapter of a config wrote in a recorded run.
 
-    Raises `ConfigError` for mistakes in the config, and `Failure`, which begins with what was
-    `asked`, if the run has other entries, or lost some.
+    Args:
+        config: The config that is to be run with them.
+        run: Folder of the recorded run.
+        asked: What the user asked for. Begins the message of a `Failure`.
+
+    Returns:
+        The messages, by adapter and port.
+
+    Raises:
+        ConfigError: The config has mistakes.
+        Failure: The run has other entries, or its recording lacks some.
     """
     asked = asked or f"--entries {run}"
     plan = resolve(config)
     layout = plan.layout
     recording = Recording(run)
-    ran_with = recording.rack_config
-    if ran_with.adapter.lan is not None and ran_with.clock.mode != "lockstep":
-        raise Failure(f"{asked}: in real time, on a network: only a run in lockstep is repeated", 2)
-    ran = {mailbox.name: mailbox for mailbox in recording.layout.mailboxes}
-    found: dict[str, Entries] = {}
+    run_config = recording.rack_config
+    if run_config.adapter.lan is not None and run_config.clock.mode != "lockstep":
+        raise Failure(
+            f"{asked}: it ran in real time on a network, but only lockstep runs can be repeated",
+            2,
+        )
+    recorded_boxes = {mailbox.name: mailbox for mailbox in recording.layout.mailboxes}
+    entries: dict[str, Entries] = {}
     for task in plan.tasks:
-        kind = find_class(task.target, object)
-        ports = kind.replayed(task.context.params, layout) if issubclass(kind, Adapter) else {}
+        adapter_class = find_class(task.target, object)
+        ports = (
+            adapter_class.replayed(task.context.params, layout)
+            if issubclass(adapter_class, Adapter)
+            else {}
+        )
         if not ports:
             continue
         boxes = {port: layout.mailbox(f"{task.task}.{port}") for port in ports}
         for box in boxes.values():
             needed = _type_of(box)
-            there = _type_of(ran[box.name]) if box.name in ran else "no such mailbox"
-            if there != needed:
-                raise Failure(f"{asked}: {box.name}: {there}; needed: {needed}", 2)
+            recorded_type = (
+                _type_of(recorded_boxes[box.name])
+                if box.name in recorded_boxes
+                else "no such mailbox"
+            )
+            if recorded_type != needed:
+                raise Failure(f"{asked}: {box.name}: {recorded_type}; needed: {needed}", 2)
             if recording.kept:
                 raise Failure(f"{asked}: {recording.kept_text}", 2)
             _check_whole(box, recording, asked)
-        found[task.task] = {port: _rows(recording, box, ports[port]) for port, box in boxes.items()}
-    if not found:
+        entries[task.task] = {
+            port: _rows(recording, box, ports[port]) for port, box in boxes.items()
+        }
+    if not entries:
         raise Failure(f"{asked}: '{config.name}' has no adapter", 2)
-    return found
+    return entries
 
 
 def recorded_commands(recording: Recording) -> tuple[Request, ...]:
-    """Return what operators commanded in a recorded run besides its config's commands, at the same
-    ticks, in their order.
+    """Load the commands that operators gave in a recorded run, in order and with their ticks.
 
-    Raises `Failure` if the recording lacks some.
+    Commands of the run's config are left out. Raises `Failure` if the recording lacks some.
     """
     commanded = _issued(recording)
     if commanded and recording.kept:
         raise Failure(f"--from {recording.folder}: {recording.kept_text}", 2)
-    for known in requests(recording.rack_config, recording.layout):
-        # Issued at its tick, or later in real time: the same may have been commanded before it.
-        later = (r for r in commanded if r.tick >= known.tick)
-        given = (r for r in later if replace(r, tick=known.tick) == known)
-        if (one := next(given, None)) is not None:
-            commanded.remove(one)
+    for configured in requests(recording.rack_config, recording.layout):
+        # In real time the config's command may have been issued after its tick. An equal command
+        # issued earlier came from an operator.
+        candidates = (request for request in commanded if request.tick >= configured.tick)
+        matching = (
+            request
+            for request in candidates
+            if replace(request, tick=configured.tick) == configured
+        )
+        if (same := next(matching, None)) is not None:
+            commanded.remove(same)
     return tuple(commanded)
 
 
 def commands_from(recording: Recording, tick: int) -> tuple[Request, ...]:
-    """Return all commands issued in a recorded run from `tick` on, those of its config too, in
-    their order; of a flight recorder's run, until the end of what it kept around that tick.
+    """Load all commands issued from `tick` on in a recorded run, including the config's commands.
 
-    Raises `Failure` if the recording lacks some.
+    For a run with a flight recorder, the commands end with the stretch that contains `tick`. Raises
+    `Failure` if the recording lacks some.
     """
     end = next((end for _, end in recording.kept if tick < end), None)
-    issued = _issued(recording)
-    return tuple(one for one in issued if tick <= one.tick and (end is None or one.tick < end))
+    return tuple(
+        request
+        for request in _issued(recording)
+        if tick <= request.tick and (end is None or request.tick < end)
+    )
 
 
 def _issued(recording: Recording) -> list[Request]:
-    """Return what the clock issued, in its order. Raises `Failure` if the recording lacks some."""
+    """Load the commands that the clock issued, in order. Raises `Failure` if some are missing."""
     layout = recording.layout
-    found: list[tuple[int, int, Request]] = []
+    numbered: list[tuple[int, int, Request]] = []
     for box in layout.mailboxes:
         if box.writer != CLOCK or box.name not in recording.mailboxes:
             continue
@@ -96,29 +127,41 @@ def _issued(recording: Recording) -> list[Request]:
         rows = recording.rows(box.name)
         messages = rows["message"]
         ids = messages[COMMAND_ID].tolist()
-        # The clock numbers commands when it issues them.
+        # Clear the id: the clock assigns it when it issues the command again.
         messages[COMMAND_ID] = 0
         for tick, number, message in zip(rows["tick"].tolist(), ids, messages, strict=True):
-            found.append((tick, number, Request(layout.index(box.name), message.tobytes(), tick)))
-    found.sort(key=lambda command: command[:2])
-    return [request for _, _, request in found]
+            numbered.append(
+                (tick, number, Request(layout.index(box.name), message.tobytes(), tick))
+            )
+    numbered.sort(key=lambda command: command[:2])
+    return [request for _, _, request in numbered]
 
 
 def _type_of(box: MailboxSpec) -> str:
+    """Describe message type, version and size of a mailbox, to compare and to report it."""
     return f"{box.message} {box.version}, {box.size} bytes"
 
 
 def _check_whole(box: MailboxSpec, recording: Recording, asked: str) -> None:
+    """Raise `Failure` if the recording lacks messages of a mailbox."""
     if lost := recording.lost.get(box.name):
         raise Failure(f"{asked}: {box.name}: its recorder lost {lost} messages", 2)
 
 
 def _rows(recording: Recording, box: MailboxSpec, is_sent: bool) -> Rows:
-    """Return the messages of a mailbox as `rack.boards.wiring` has them."""
+    """Load the messages of a mailbox in the form of `rack.boards.wiring`.
+
+    If `is_sent` is False, the adapter repeats its newest message every cycle, and repeats are left
+    out.
+    """
     if box.name not in recording.mailboxes:
         return []
     rows = [
         (int(row["tick"]), int(row["basis"]), row["message"].tobytes())
         for row in recording.rows(box.name)
     ]
-    return [row for at, row in enumerate(rows) if is_sent or not at or row[2] != rows[at - 1][2]]
+    return [
+        row
+        for index, row in enumerate(rows)
+        if is_sent or not index or row[2] != rows[index - 1][2]
+    ]

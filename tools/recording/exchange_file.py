@@ -1,8 +1,8 @@
-"""A recording as an MCAP file, for other viewers: a channel for each mailbox, its messages as JSON
-by a JSON schema, with units and meanings.
+"""Export of a recording to MCAP, for other viewers.
 
-A message's log time is simulated time since the start of the run; its publish time is the wall
-clock when it was written. Events are a channel of their own.
+Each mailbox is a channel with JSON messages and a JSON schema that contains units and meanings. The
+log time of a message is simulated time since the start of the run; its publish time is the
+wall-clock time at which it was written. Events have their own channel.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ EVENT_SCHEMA = {
 }
 ENCODING = "jsonschema"
 BLOCK = 1024
-"""Messages of a mailbox that are made into JSON at once."""
+"""Number of messages of a mailbox that are converted to JSON together."""
 
 
 class ChannelMessage(NamedTuple):
-    """A message of a channel. They sort by time."""
+    """A message of a channel. Messages sort by time."""
 
     log_ns: int  # simulated, since the start of the run
     channel: int
@@ -43,20 +43,29 @@ class ChannelMessage(NamedTuple):
     data: bytes
 
 
-def export(recording: Recording, path: Path, show: Callable[[float], None]) -> int:
-    """Write the file; return its number of messages. `show` is called with the part that is
-    done.
+def export(recording: Recording, path: Path, show_progress: Callable[[float], None]) -> int:
+    """Write a recording as an MCAP file.
+
+    Args:
+        recording: The recording.
+        path: File to write.
+        show_progress: Called with the completed fraction, 0 to 1.
+
+    Returns:
+        Number of messages in the file.
     """
     boxes = {box.name: box for box in recording.layout.mailboxes}
-    found = [boxes[name] for name in recording.mailboxes]
-    total = sum(len(recording.signal(box.name, "serial")) for box in found)
+    boxes_recorded = [boxes[name] for name in recording.mailboxes]
+    total = sum(len(recording.signal(box.name, "serial")) for box in boxes_recorded)
     count = 0
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start(library="nasrem-rack")
         writer.add_metadata("rack", {"name": recording.layout.rack, CONFIG: recording.config})
-        channels = [_channel(writer, box.name, box.message, _schema(box)) for box in found]
-        streams = [_samples(recording, *pair) for pair in zip(found, channels, strict=True)]
+        channels = [_channel(writer, box.name, box.message, _schema(box)) for box in boxes_recorded]
+        streams = [
+            _samples(recording, *pair) for pair in zip(boxes_recorded, channels, strict=True)
+        ]
         events = _channel(writer, EVENTS, "event", EVENT_SCHEMA)
         for sample in merge(_events(recording, events), *streams):
             writer.add_message(
@@ -64,19 +73,21 @@ def export(recording: Recording, path: Path, show: Callable[[float], None]) -> i
             )
             count += 1
             if count % BLOCK == 0:
-                show(count / total)
+                show_progress(count / total)
         writer.finish()  # type: ignore[no-untyped-call]
     return count
 
 
 def _channel(writer: Writer, topic: str, message: str, schema: Document) -> int:
-    made = writer.register_schema(message, ENCODING, encode_json(schema).encode())
-    return writer.register_channel(topic, "json", made)
+    """Register a channel with its schema, and return its number."""
+    schema_id = writer.register_schema(message, ENCODING, encode_json(schema).encode())
+    return writer.register_channel(topic, "json", schema_id)
 
 
 def _schema(box: MailboxSpec) -> Document:
-    """Return the JSON schema of a message; groups of fields are flattened, as in the parquet
-    files.
+    """Return the JSON schema of a mailbox's messages.
+
+    Groups of fields are flattened, as in the parquet files.
     """
     head = {
         "serial": {"type": "integer", "description": "of the message, rising by one"},
@@ -112,6 +123,7 @@ def _samples(recording: Recording, box: MailboxSpec, channel: int) -> Iterator[C
 
 
 def _events(recording: Recording, channel: int) -> Iterator[ChannelMessage]:
+    """Yield the events that have a tick, oldest first."""
     ticked = [event for event in recording.events if event.get("tick", -1) >= 0]
     clock_ns = recording.layout.clock_ns
     for number, event in enumerate(ticked):

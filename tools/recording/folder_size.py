@@ -1,4 +1,4 @@
-"""The size of a recording."""
+"""Disk space of a recording."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ RECORDED = (".toml", ".jsonl", ".spool", ".parquet", ".rrd", "published.json", C
 
 
 def size_of(folder: Path) -> int:
-    """Return the bytes of what is recorded of a run, without reports and pictures."""
+    """Return the size of a run's recorded files, bytes. Reports and pictures do not count."""
     size = 0
     for file in folder.rglob("*"):
-        # A flight recorder removes some.
+        # A flight recorder may remove files at any time.
         with suppress(FileNotFoundError):
             if file.name.endswith(RECORDED) and file.is_file():
                 size += file.stat().st_size
@@ -23,17 +23,17 @@ def size_of(folder: Path) -> int:
 
 
 def size_text(size: int, lasted_s: float) -> str:
-    """Return the bytes of a recording, and of a second of it, as text."""
+    """Format the size of a recording, bytes, and its rate over `lasted_s` of simulated time."""
     rate = f", {size * 1e-6 / lasted_s:.2f} MB/s" if lasted_s else ""
     return f"{size * 1e-6:.1f} MB{rate}"
 
 
 def recorded_line(folder: Path, lasted_s: float) -> str:
-    """Return where a run is recorded, and how large that is, as text."""
+    """Return a line that says where a run is recorded and how large the recording is."""
     return f"recorded into {folder}: {size_text(size_of(folder), lasted_s)}"
 
 
 def sizes(folder: Path, lasted_s: float) -> dict[str, float | None]:
-    """Return the bytes of a recording, and of a second of it, for programs."""
+    """Return the size of a recording and its rate per simulated second, as plain data."""
     size = size_of(folder)
     return {"bytes": size, "bytes_per_s": round(size / lasted_s, 1) if lasted_s else None}

@@ -1,4 +1,4 @@
-"""What happened in a run: misses, what the machine did to its cores, and holds."""
+"""History of a run: missed cycles, holds, and what the machine did to the cores."""
 
 from __future__ import annotations
 
@@ -19,31 +19,36 @@ if TYPE_CHECKING:
     from rack.tools.recording.recording import Recording
 
 OWN = "holding"
-"""`by` of a hold whose reason comes from the level itself."""
+"""Value of `by` for a hold that the level itself decided."""
 
 
 def misses(recording: Recording) -> list[Document]:
-    """Return every miss in the trace, earliest first: task, tick, `what` ("late" or "skipped"),
-    count, times.
+    """List every missed cycle of the trace, earliest first.
 
-    A skipped release leaves no record of its own: the next record has the number skipped before it.
-    After the last record, the counts of the run's end show them.
+    A skipped release leaves no record: the next record of the task holds the number of releases
+    skipped before it. Releases skipped after the last record follow from the counts at the end of
+    the run.
+
+    Returns:
+        Entries with task, tick, `what` ("late" or "skipped") and count; for late cycles also the
+        times.
     """
-    found = []
+    entries = []
     for task in recording.layout.tasks:
-        found += _misses_of(task, recording.trace(task.name))
+        entries += _misses_of(task, recording.trace(task.name))
         done = recording.counts(task.name).get("done")
         if done is None:
-            # The end is not recorded, or was by an earlier version.
+            # The end of the run was not recorded, or an earlier version recorded it.
             continue
         if count := task.count_unfinished(done, recording.ended["outcome"]["ticks"]):
-            found.append(_skipped(task, task.grid.since(done + 1), count))
-    return sorted(found, key=lambda miss: (miss["tick"], miss["task"]))
+            entries.append(_skipped(task, task.grid.since(done + 1), count))
+    return sorted(entries, key=lambda miss: (miss["tick"], miss["task"]))
 
 
 def _misses_of(task: TaskSpec, cycles: np.ndarray) -> list[Document]:
+    """Return the missed cycles that the trace of one task shows."""
     rows = cycles[is_missed(cycles) | (skipped(cycles) > 0)]
-    found = []
+    entries = []
     columns = (
         rows["tick"],
         skipped(rows),
@@ -51,33 +56,35 @@ def _misses_of(task: TaskSpec, cycles: np.ndarray) -> list[Document]:
         lateness_ns(rows) * 1e-6,
         lasted_ns(rows) * 1e-6,
     )
-    for tick, before, missed, late_ms, took_ms in zip(
+    for tick, skipped_before, missed, late_ms, lasted_ms in zip(
         *(column.tolist() for column in columns), strict=True
     ):
-        if before:
-            found.append(_skipped(task, tick - before * task.every, before))
+        if skipped_before:
+            entries.append(_skipped(task, tick - skipped_before * task.every, skipped_before))
         if missed:
-            times = {"started_ms": round(late_ms, 6), "took_ms": round(took_ms, 6)}
-            found.append({"task": task.name, "tick": tick, "what": "late", "count": 1, **times})
-    return found
+            times = {"started_ms": round(late_ms, 6), "took_ms": round(lasted_ms, 6)}
+            entries.append({"task": task.name, "tick": tick, "what": "late", "count": 1, **times})
+    return entries
 
 
 def _skipped(task: TaskSpec, tick: int, count: int) -> Document:
+    """Return the entry for skipped releases of a task, of which the first is at `tick`."""
     return {"task": task.name, "tick": tick, "what": "skipped", "count": count}
 
 
-def counted(found: Sequence[Document]) -> tuple[int, int]:
-    """Return how many cycles of `misses` ended late, and how many were skipped."""
+def counted(entries: Sequence[Document]) -> tuple[int, int]:
+    """Return how many cycles of a list from `list_misses` were late, and how many were skipped."""
     late, left_out = (
-        sum(miss["count"] for miss in found if miss["what"] == what) for what in ("late", "skipped")
+        sum(miss["count"] for miss in entries if miss["what"] == kind)
+        for kind in ("late", "skipped")
     )
     return late, left_out
 
 
 def steal(recording: Recording) -> Document:
-    """Return the time stolen by the hypervisor, by core: ms, and `percent` of the run's time.
+    """Return the time that the hypervisor stole from each core, ms and percent of the run.
 
-    In lockstep, and where the kernel does not count it, steal is not `measured`.
+    `measured` is False in lockstep, and where the kernel does not count steal.
     """
     record = recording.cores
     stolen_ms = {str(core): ms for core, ms in record.stolen_ms().items()}
@@ -86,40 +93,44 @@ def steal(recording: Recording) -> Document:
 
 
 def frequency(recording: Recording) -> dict[str, dict[str, float]] | None:
-    """Return lowest and highest MHz by core; None where they were not measured."""
+    """Return the lowest and highest frequency of each core, MHz, or None if it was not measured."""
     return {str(core): {"min": low, "max": high} for core, low, high in recording.cores.mhz} or None
 
 
 def holds(recording: Recording) -> list[Document]:
-    """Return every hold, the earliest first; `until_s` is None where it lasted to the end of the
-    run.
+    """List every hold, earliest first.
 
-    `by` is "operator", with the command as `why`; or "holding", with the last reason that the level
-    gave.
+    Returns:
+        Entries with the level, times in seconds, `by` and `why`. `by` is "operator", with the
+        command as `why`, or "holding", with the last reason that the level gave. `until_s` is None
+        for a hold that lasted to the end of the run.
     """
     levels = [
         mailbox.removesuffix(".status")
         for mailbox in recording.mailboxes
         if mailbox.endswith(".status")
     ]
-    found = [hold for level in levels for hold in _holds_of(recording, level)]
-    return sorted(found, key=lambda hold: (hold["since_s"], hold["level"]))
+    hold_entries = [hold for level in levels for hold in _holds_of(recording, level)]
+    return sorted(hold_entries, key=lambda hold: (hold["since_s"], hold["level"]))
 
 
 def fired_rows(recording: Recording) -> dict[str, list[Document]]:
-    """Return, by level with state tables, the rows that fired: table, row, name, cycles, and when
-    first.
+    """List the rows of state tables that fired, by level.
+
+    Returns:
+        For each level its rows in the order in which they first fired: table, row, name, number of
+        cycles, and simulated time of the first firing.
     """
-    found = {}
+    by_level = {}
     for mailbox in recording.mailboxes:
         if not {"table", "row", "fired"} <= recording.fields(mailbox):
             continue
         columns = ("table", "row", "fired")
         rows = [*zip(*(recording.signal(mailbox, name).tolist() for name in columns), strict=True)]
         times_s = recording.signal(mailbox, "tick") * recording.layout.clock_ns * 1e-9
-        # Backwards, so that the earliest time of each row stays.
+        # Iterate backwards, so that the dictionary keeps the earliest time of each row.
         first_s = dict(zip(reversed(rows), reversed(times_s.tolist()), strict=True))
-        found[mailbox.removesuffix(".status")] = [
+        by_level[mailbox.removesuffix(".status")] = [
             {
                 "table": table,
                 "row": number,
@@ -127,31 +138,32 @@ def fired_rows(recording: Recording) -> dict[str, list[Document]]:
                 "cycles": count,
                 "first_s": round(first_s[table, number, name], 6),
             }
-            # In the order in which they fired first.
+            # `Counter` keeps the order in which the rows first fired.
             for (table, number, name), count in Counter(rows).items()
         ]
-    return found
+    return by_level
 
 
 def _holds_of(recording: Recording, level: str) -> Iterator[Document]:
+    """Yield the holds of one level, from its statuses."""
     mailbox = f"{level}.status"
     tick_s = recording.layout.clock_ns * 1e-9
     fields = recording.fields(mailbox)
     if "state" not in fields:
         return
     ticks = recording.signal(mailbox, "tick")
-    own = recording.signal(mailbox, "state") == State.HOLDING
-    standing = (
+    is_level_holding = recording.signal(mailbox, "state") == State.HOLDING
+    standing_commands = (
         recording.signal(mailbox, "standing").astype(int)
         if "standing" in fields
         else np.zeros(len(ticks), int)
     )
     # An operator's command takes precedence over the level's own state.
-    what = np.where(standing > 0, standing, -own.astype(int))
-    for first, end in _stretches(what):
-        is_operators = what[first] > 0
+    hold_codes = np.where(standing_commands > 0, standing_commands, -is_level_holding.astype(int))
+    for first, end in _stretches(hold_codes):
+        is_operators = hold_codes[first] > 0
         why = (
-            Operation(what[first]).name.lower()
+            Operation(hold_codes[first]).name.lower()
             if is_operators
             else recording.reason(mailbox, end - 1)
         )
@@ -166,9 +178,11 @@ def _holds_of(recording: Recording, level: str) -> Iterator[Document]:
         }
 
 
-def _stretches(what: np.ndarray) -> list[tuple[int, int]]:
-    """Return the stretches of equal numbers other than 0, each as its first place and the one after
-    its last.
+def _stretches(numbers: np.ndarray) -> list[tuple[int, int]]:
+    """Split an array into runs of equal numbers, leaving out runs of 0.
+
+    Returns:
+        The first index of each run, and the index after its last.
     """
-    borders = [0, *(np.flatnonzero(np.diff(what)) + 1).tolist(), len(what)]
-    return [(first, end) for first, end in pairwise(borders) if first < end and what[first]]
+    borders = [0, *(np.flatnonzero(np.diff(numbers)) + 1).tolist(), len(numbers)]
+    return [(first, end) for first, end in pairwise(borders) if first < end and numbers[first]]

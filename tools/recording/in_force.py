@@ -1,6 +1,4 @@
-"""The messages of a recorded run that are in force at a tick, and the ticks at which a condition
-begins to hold: what readers released then find. Any tick comes from the recording alone.
-"""
+"""Finds the messages that are visible at any tick of a recorded run, and trigger ticks."""
 
 from __future__ import annotations
 
@@ -11,21 +9,24 @@ from rack.tools.recording.signal import Trigger
 
 
 class InForce:
-    """The messages of a run by the tick at which they are read; mailboxes load on first use."""
+    """The messages of a run by the tick at which readers see them. Mailboxes load on first use."""
 
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
         self._rows: dict[str, np.ndarray] = {}
 
     def row(self, mailbox: str, tick: int) -> np.ndarray | None:
-        """Return the newest row of a mailbox that is visible at `tick`; None before the first."""
+        """Return the newest row of a mailbox that is visible at `tick`, or None if none is."""
         rows = self._of(mailbox)
         visible = np.flatnonzero(rows["visible_at"] <= tick)
         return rows[visible[-1]] if len(visible) else None
 
     def begins(self, condition: Trigger) -> np.ndarray:
-        """Return the ticks at which readers find a condition to hold that did not hold in the
-        message before, (times,), the earliest first.
+        """Find the ticks at which readers see a condition become true.
+
+        Returns:
+            Ticks, shape (times,), earliest first. In the message before each of them the condition
+            was false.
         """
         rows = self._of(condition.signal.mailbox)
         holds = condition.holds(rows["message"])
@@ -34,6 +35,7 @@ class InForce:
         return ticks
 
     def _of(self, mailbox: str) -> np.ndarray:
+        """Return all rows of a mailbox, from memory after the first call."""
         if mailbox not in self._rows:
             self._rows[mailbox] = self._recording.rows(mailbox)
         return self._rows[mailbox]

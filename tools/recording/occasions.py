@@ -1,4 +1,4 @@
-"""What a flight recorder keeps for good: which occasions count, and the ticks around each."""
+"""Decides what a flight recorder keeps: which occasions count, and the ticks around each."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from rack.boards.config.record import RecordConfig
 from rack.boards.timing.trace_times import is_missed, skipped
 
 ORDINARY = (Alarm.COMMANDED,)
-"""Alarms of an ordinary run. All others count: faults, detections, brakes, restarts."""
+"""Alarms that are no occasion. All others count: faults, detections, brakes, restarts."""
 
 
 class TickRange(NamedTuple):
-    """Ticks from `first` to `last`."""
+    """Ticks from `first` to `last`, inclusive."""
 
     first: int
     last: int
 
 
 class Retention(NamedTuple):
-    """What `[record]` wants to be kept, in ticks."""
+    """The settings `keep`, `before` and `after` of `[record]`, in ticks."""
 
     keep: int
     before: int
@@ -35,7 +35,7 @@ class Retention(NamedTuple):
 
     @classmethod
     def of(cls, segment: Segment) -> Self | None:
-        """Return it for a rack; None: everything is kept."""
+        """Read the settings of a rack. Returns None if its recorder keeps everything."""
         config = RecordConfig.model_validate(load_toml(segment.config).get("record", {}))
         if config.keep is None:
             return None
@@ -43,18 +43,22 @@ class Retention(NamedTuple):
         return cls(*(round(span_s * 1e9 / segment.layout.clock_ns) for span_s in spans_s))
 
     def around(self, tick: int) -> TickRange:
-        """Return what is kept around an occasion."""
+        """Return the ticks that are kept around an occasion."""
         return TickRange(max(0, tick - self.before), tick + self.after)
 
     def absent(
         self, segment: Segment, kept: Sequence[tuple[int, int]], ticks: int
     ) -> list[TickRange]:
-        """Return what had to be kept of a run of `ticks`, as far as its alarm rings still say, and
-        is not within the ticks `kept`, [first, end).
+        """Find the ticks that should have been kept but were not.
+
+        Args:
+            segment: The rack, whose alarm rings still hold its last alarms.
+            kept: Ticks that were kept, as ranges [first, end).
+            ticks: Length of the run.
         """
         occasions = Occasions(segment).alarms()
-        wanted = [TickRange(max(0, ticks - self.keep), ticks - 1), *map(self.around, occasions)]
-        clipped = [TickRange(first, min(last, ticks - 1)) for first, last in wanted]
+        windows = [TickRange(max(0, ticks - self.keep), ticks - 1), *map(self.around, occasions)]
+        clipped = [TickRange(first, min(last, ticks - 1)) for first, last in windows]
         return [
             window
             for window in clipped
@@ -63,7 +67,7 @@ class Retention(NamedTuple):
 
 
 class Occasions:
-    """Finds the ticks of occasions: alarms, cycles missed or skipped, holds that begin or end."""
+    """Finds the ticks of occasions: alarms, missed or skipped cycles, and changes of holds."""
 
     def __init__(self, segment: Segment) -> None:
         layout = segment.layout
@@ -77,18 +81,18 @@ class Occasions:
         }
 
     def alarms(self) -> Iterator[int]:
-        """Yield those of the alarms since the last call; of the first one, all that are left."""
+        """Yield the ticks of alarms since the last call, or of all remaining alarms at first."""
         for ring in self._alarms:
             rows = ring.drain().rows
             yield from rows["tick"][~np.isin(rows["code"], ORDINARY)].tolist()
 
     def within(self, ring: str, rows: np.ndarray) -> Iterator[int]:
-        """Yield those in rows of a ring."""
+        """Yield the ticks of occasions in rows of a ring."""
         ticks = rows["tick"]
         if ring in self._tasks:
             yield from ticks[is_missed(rows) | (skipped(rows) > 0)].tolist()
         elif ring in self._holding and len(rows):
             holding = rows["message"]["state"] == State.HOLDING
-            before = np.concatenate(([self._holding[ring]], holding[:-1]))
+            held_before = np.concatenate(([self._holding[ring]], holding[:-1]))
             self._holding[ring] = bool(holding[-1])
-            yield from ticks[holding != before].tolist()
+            yield from ticks[holding != held_before].tolist()

@@ -1,9 +1,8 @@
-"""Where a run comes from: the run that it goes on from, origin.json in its folder, and the code and
-the files with which it was made, code.json.
+"""The origin of a run: the run that it continues, and the code and files that produced it.
 
-A run is repeated by its own code alone. So the versions are recorded, and a digest of the program,
-of each file of the user's levels, and of the model's folder. Launching a run needs this, so it
-imports nothing that reads recordings.
+A run can only be repeated with the same code. `code.json` therefore stores versions, and digests of
+the program, of the user's levels and of the model's folder; `origin.json` stores the continued run.
+Launching a run imports this module, so it imports nothing that reads recordings.
 """
 
 from __future__ import annotations
@@ -30,14 +29,14 @@ if TYPE_CHECKING:
 
 PROGRAM = "rack"
 FLOORS = Path(__file__).resolve().parents[2]
-"""The folder with the packages of the program."""
+"""Folder that contains the packages of the program."""
 
 
 def write_code(config: RackConfig, folder: Path) -> None:
-    """Write with what a run is made, after its levels have been loaded. Raises `OSError`."""
+    """Write code.json for a run whose levels have been loaded. Raises `OSError`."""
     files = [getattr(module, "__file__", None) for module in [*sys.modules.values()]]
-    own = [Path(file) for file in files if file]
-    paths = {path for path in own if any(path.is_relative_to(p) for p in config.python_path)}
+    code_files = [Path(file) for file in files if file]
+    paths = {path for path in code_files if any(path.is_relative_to(p) for p in config.python_path)}
     if config.robot is not None:
         paths.add(config.robot.model.parent)
     names = ["version", "python", PROGRAM, *sorted(map(str, paths))]
@@ -45,27 +44,34 @@ def write_code(config: RackConfig, folder: Path) -> None:
 
 
 def check_code(recording: Recording, asked: str, anyway: bool) -> None:
-    """Note on stderr what has changed since a run, if it is to be repeated `anyway`. Raises
-    `Failure`, which begins with what was `asked`, if it is not.
+    """Check that the code and files of a run are unchanged before it is repeated.
+
+    Args:
+        recording: The run.
+        asked: What the user asked for. Begins the message.
+        anyway: Whether to continue despite changes, with a note on stderr.
+
+    Raises:
+        Failure: Something has changed, or is unknown, and `anyway` is False.
     """
     path = recording.folder / CODE
     if not path.exists():
-        why = f"it has no {CODE}: 'rack record' or an older version recorded it"
+        why = f"it has no {CODE}, because 'rack record' or an older version recorded it"
     else:
         recording.checksums.verify(CODE)
         recorded: dict[str, str] = json.loads(read_file(path))
-        differ = [name for name, state in recorded.items() if _state_of(name) != state]
-        if not differ:
+        changed = [name for name, state in recorded.items() if _state_of(name) != state]
+        if not changed:
             return
-        shown = ", ".join("the code of rack" if name == PROGRAM else name for name in differ)
-        why = f"since it was recorded, these have changed: {shown}"
+        names = ", ".join("the code of rack" if name == PROGRAM else name for name in changed)
+        why = f"since it was recorded, these have changed: {names}"
     if not anyway:
-        raise Failure(f"{asked}: {why}; --anyway continues it: digests may differ", 2)
+        raise Failure(f"{asked}: {why}; --anyway continues it, but digests may differ", 2)
     print(f"{asked}: {why}; digests may differ", file=sys.stderr)
 
 
 def _state_of(name: str) -> str:
-    """Return the version, or the digest, of what is named."""
+    """Return the version of a component, or the digest of a file or folder."""
     if name == "version":
         return version("nasrem-rack")
     if name == "python":
@@ -78,17 +84,19 @@ def _state_of(name: str) -> str:
         paths = [*path.rglob("*.xml")]
     digest = xxh3_128()
     for path in sorted(paths):
-        # One that is gone has another digest.
+        # A missing file changes the digest as well.
         digest.update(path.name.encode() + (path.read_bytes() if path.is_file() else b""))
     return digest.hexdigest()
 
 
 @dataclass(frozen=True)
 class Origin:
-    """The run that another one goes on from before `tick`.
+    """The run that another run continues.
 
-    `folder`: as its user named it. `launched_ns`: when it was launched, on the wall clock; no other
-    run has that.
+    Attributes:
+        folder: Folder of that run, as the user named it.
+        tick: First tick of the later run.
+        launched_ns: Launch time of that run on the wall clock, which identifies it.
     """
 
     folder: str
@@ -97,13 +105,18 @@ class Origin:
 
     @classmethod
     def at(cls, run: Recording, tick: int) -> Self:
-        """Return it for what goes on from a run."""
+        """Return the origin of a run that continues `run` from a tick."""
         return cls(str(run.folder), tick, run.launch.created_ns)
 
     @classmethod
     def of(cls, recording: Recording) -> Self | None:
-        """Return it for a recorded run; None for one that goes on from no other. Raises `Failure`
-        for a damaged file.
+        """Read the origin of a recorded run.
+
+        Returns:
+            The origin, or None if the run does not continue another one.
+
+        Raises:
+            Failure: The file is damaged.
         """
         path = recording.folder / ORIGIN
         if not path.exists():
@@ -112,19 +125,19 @@ class Origin:
         return cls(**json.loads(read_file(path)))
 
     def is_of(self, run: Recording) -> bool:
-        """Return whether it is this run, and no other one of that name."""
+        """Return True if this is the origin's run, not another run with the same folder name."""
         return run.launch.created_ns == self.launched_ns
 
     def write(self, folder: Path) -> None:
-        """Write it into the folder of the later run. Raises `OSError`."""
+        """Write origin.json into the folder of the later run. Raises `OSError`."""
         (folder / ORIGIN).write_text(encode_json(asdict(self)) + "\n")
 
     def document(self, clock_ns: int) -> Document:
-        """Return it as plain data, with its simulated time, s."""
+        """Return the origin as plain data, with its tick also as simulated time, s."""
         return {**asdict(self), "time_s": round(self.tick * clock_ns * 1e-9, 9)}
 
 
 def continued_at(recording: Recording) -> int | None:
-    """Return the tick before which a run that goes on from another begins; None for any other."""
-    found = (event["tick"] for event in recording.events if event.get("code") == CONTINUES)
-    return next(found, None)
+    """Return the first tick of a run that continues another one, or None for any other run."""
+    ticks = (event["tick"] for event in recording.events if event.get("code") == CONTINUES)
+    return next(ticks, None)

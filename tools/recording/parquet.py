@@ -1,10 +1,11 @@
 """The parquet tables of a run.
 
-cycles.parquet is the trace: one row a cycle of a task, the same columns for all tasks. Its metadata
-hold the layout, and when the rack was launched.
+cycles.parquet is the trace, with one row for each cycle of a task and the same columns for all
+tasks. Its metadata contain the layout and the time of the launch.
 
-signals/ has a table for each mailbox that tasks and clock write, one row a message. Each is a
-folder, which parquet's readers take for one table: a long run has many parts.
+signals/ has a table for each mailbox that a task or the clock writes, with one row for each
+message. Each table is a folder of parts, which parquet readers open as one table, because a long
+run has many parts.
 """
 
 from __future__ import annotations
@@ -27,23 +28,25 @@ from rack.tools.recording.cores import CoreRecord
 
 TRACE_FIELDS = (pa.field("task", pa.string()), *(pa.field(name, pa.int64()) for name in FIELDS))
 HEAD = ("serial", "tick", "visible_at", "basis", "stamp_ns", "chain")
-"""Columns that the messages of all mailboxes have; the first of a table, after `TIME`."""
+"""Columns of every mailbox's messages. In a table they follow `TIME_COLUMN`."""
 TIME = "time_s"
-"""The tick as simulated time, s."""
+"""Column with the tick as simulated time, s."""
 TRACE_ROWS = 1 << 16
 MESSAGE_ROWS = 8192
 MESSAGE_BYTES = 16 << 20
-"""Rows are written in large blocks: a file's footer has an entry for every column of every
-block."""
+"""Sizes at which rows are written.
+
+Blocks are large because a file's footer has an entry for every column of every block.
+"""
 SIGNALS = "signals"
 TABLE = "{}.parquet"
 PART = "{:04}.parquet"
 PART_ENTRIES = 1 << 12
-"""Entries after which a part is finished: until then they are in memory, 0.7 kB each."""
+"""Number of footer entries after which a part is finished. An open part keeps 0.7 kB for each."""
 
 
 class CyclesFile:
-    """cycles.parquet, being written."""
+    """Writer of cycles.parquet."""
 
     def __init__(self, path: Path, layout: Layout, launch: Launch) -> None:
         self._waiting: list[tuple[str, np.ndarray]] = []
@@ -70,9 +73,10 @@ class CyclesFile:
             self._flush()
 
     def _flush(self) -> None:
+        """Write the waiting records as one block."""
         if not self._waiting:
             return
-        # Sorted by task, so that the rows of each are contiguous.
+        # Sort by task, so that the rows of each task are contiguous.
         waiting = sorted(self._waiting, key=lambda block: block[0])
         rows = np.concatenate([block for _, block in waiting])
         names = np.repeat([task for task, _ in waiting], [len(block) for _, block in waiting])
@@ -90,8 +94,13 @@ class CyclesFile:
         gaps: Sequence[tuple[str, int, int]],
         kept: Sequence[tuple[int, int]],
     ) -> None:
-        """Finish the file; store as metadata the rows lost by task and by mailbox, what the machine
-        did to its cores, the gaps, and the ticks of the stretches that a flight recorder kept.
+        """Finish the file and store these facts as metadata.
+
+        Args:
+            lost: Number of lost rows, by task and by mailbox.
+            cores: What the machine did to its cores.
+            gaps: Ring, first and last tick of each gap.
+            kept: Ticks that a flight recorder kept, as ranges [first, end).
         """
         self._flush()
         metadata = {
@@ -105,9 +114,7 @@ class CyclesFile:
 
 
 def signal_tables(folder: Path, layout: Layout) -> dict[str, SignalTable]:
-    """Return the tables of signals/, by mailbox; what a killed recorder has left there is
-    replaced.
-    """
+    """Create the tables in signals/, by mailbox, replacing tables of a killed recorder."""
     if folder.exists():
         rmtree(folder)
     return {
@@ -117,7 +124,7 @@ def signal_tables(folder: Path, layout: Layout) -> dict[str, SignalTable]:
 
 
 class SignalTable:
-    """The table of a mailbox, being written: a folder of parts."""
+    """Writer of the table of a mailbox, which is a folder of parts."""
 
     def __init__(self, folder: Path, mailbox: MailboxSpec, layout: Layout) -> None:
         folder.mkdir(parents=True)
@@ -134,6 +141,7 @@ class SignalTable:
         self._begin_part()
 
     def _begin_part(self) -> None:
+        """Open the next part."""
         self._parts += 1
         self._entries = 0
         self._writer = pq.ParquetWriter(
@@ -146,7 +154,7 @@ class SignalTable:
         )
 
     def add(self, rows: np.ndarray) -> None:
-        """Add rows of the mailbox's ring, shape (rows,), at least one."""
+        """Add at least one row of the mailbox's ring, shape (rows,)."""
         self._waiting.append(rows)
         if (
             sum(map(len, self._waiting)) >= MESSAGE_ROWS
@@ -155,6 +163,7 @@ class SignalTable:
             self._flush()
 
     def _flush(self) -> None:
+        """Write the waiting rows as one block, and finish the part if its footer is large."""
         if not self._waiting:
             return
         rows = np.concatenate(self._waiting)
@@ -172,19 +181,19 @@ class SignalTable:
             self._begin_part()
 
     def close(self) -> None:
-        """Finish the last part."""
+        """Write the waiting rows and finish the last part."""
         self._flush()
         self._writer.close()
 
 
 @dataclass(frozen=True)
 class Column:
-    """A field of a mailbox's messages, a column of its table.
+    """A field of a mailbox's messages, which is a column of its table.
 
     Attributes:
         name: Mailbox, groups and field, as in `servo.status.position`.
         mailbox: Name of the mailbox.
-        path: Names of the groups that hold the field, and of the field.
+        path: Names of the groups that contain the field, and of the field.
         shape: Shape of the field in a message, () for a single value.
         spec: The field.
     """
@@ -197,31 +206,31 @@ class Column:
 
     @property
     def label(self) -> str:
-        """Its name in the table; that of a field named like a column of the head differs."""
+        """Name of the column in the table. Prefixed if a head column has the same name."""
         name = ".".join(self.path)
         return f"message.{name}" if name in (TIME, *HEAD) else name
 
     @property
     def is_text(self) -> bool:
-        """Whether it is text."""
+        """True if the field holds text."""
         return self.spec.kind[1] == "S"
 
     @property
     def arrow_field(self) -> pa.Field:
-        """The column's Arrow field; shape and unit are in its metadata."""
+        """Arrow field of the column, with shape and unit in its metadata."""
         element = pa.string() if self.is_text else pa.from_numpy_dtype(np.dtype(self.spec.kind))
         arrow = pa.list_(element, prod(self.shape)) if self.shape else element
         metadata = {"shape": encode_json(self.shape), "unit": self.spec.unit}
         return pa.field(self.label, arrow, metadata=metadata)
 
     def values(self, messages: np.ndarray) -> np.ndarray:
-        """Return the field in a block of messages, shape (rows, *shape): a view."""
+        """Return the field in a block of messages, as a view of shape (rows, *shape)."""
         for key in self.path:
             messages = messages[key]
         return messages
 
     def array(self, messages: np.ndarray) -> pa.Array:
-        """Return the column of a block of messages, shape (rows,)."""
+        """Convert the field in a block of messages to an Arrow array, shape (rows,)."""
         flat = np.ascontiguousarray(self.values(messages)).reshape(-1)
         values = pa.array(np.strings.decode(flat, "ascii", "replace") if self.is_text else flat)
         if not self.shape:
@@ -230,15 +239,21 @@ class Column:
 
 
 def columns_of(mailbox: MailboxSpec) -> list[Column]:
-    """Return the columns of a mailbox in the order of its fields; groups of fields are
-    flattened.
-    """
+    """Return the columns of a mailbox in the order of its fields, with nested fields flattened."""
     return list(_columns(mailbox.name, (), (), mailbox.fields))
 
 
 def _columns(
     mailbox: str, path: tuple[str, ...], outer: tuple[int, ...], fields: Sequence[FieldSpec]
 ) -> Iterator[Column]:
+    """Yield the columns of fields, and of groups within them.
+
+    Args:
+        mailbox: Name of the mailbox.
+        path: Names of the groups that contain the fields.
+        outer: Shape of these groups.
+        fields: The fields.
+    """
     for field in fields:
         inner = (*path, field.name)
         shape = outer + field.shape

@@ -1,4 +1,4 @@
-"""A recording, read back: the trace, the signals and the events of one run."""
+"""Reads a recorded run: its trace, signals and events."""
 
 from __future__ import annotations
 
@@ -40,8 +40,12 @@ from rack.tools.recording.spool import STRETCHES, rings
 
 
 class Gap(NamedTuple):
-    """Ticks of which a recording lacks rows, from the first to the last, and of which tasks and
-    mailboxes.
+    """A range of ticks in which a recording lacks rows.
+
+    Attributes:
+        first: First tick.
+        last: Last tick.
+        rings: Tasks and mailboxes whose rows are missing.
     """
 
     first: int
@@ -49,7 +53,7 @@ class Gap(NamedTuple):
     rings: tuple[str, ...]
 
     def __str__(self) -> str:
-        """Return it as text."""
+        """Return the gap as a clause for the user."""
         more = f" and {len(self.rings) - 3} more" if len(self.rings) > 3 else ""
         return (
             f"ticks {self.first:,} to {self.last:,} of {', '.join(self.rings[:3])}{more} are not"
@@ -58,17 +62,28 @@ class Gap(NamedTuple):
 
 
 SHOWN = 20
-"""Stretches of which a text says from when to when they are."""
+"""Number of kept stretches that a text lists."""
 UNREADABLE = (pa.ArrowException, OSError, ValueError, KeyError, TypeError)
-"""Errors of reading a damaged file, or a file of another kind."""
+"""Errors raised by reading a damaged file or a file of another kind."""
 
 
 class Recording:
-    """The folder of a run. Every part raises `Failure`, with the file and its fault, when it cannot
-    be read.
+    """The folder of a run. Reading any part of it raises `Failure` if the part is unreadable.
 
-    The spool of a recorder that was killed is first turned into readable files, with a note on
-    stderr; so are the stretches that a flight recorder kept.
+    Opening it first builds the readable files from the spool of a killed recorder, with a note on
+    stderr, or from the stretches of a flight recorder.
+
+    Attributes:
+        folder: The folder.
+        checksums: Checksums of its files.
+        config: The resolved config, as TOML text.
+        layout: Layout of the rack.
+        launch: Time of the rack's launch.
+        cores: What the machine did to the cores. Empty if the recorder did not measure it or was
+            killed.
+        kept: Ticks that a flight recorder kept, as ranges [first, end). Empty if it removed
+            nothing.
+        events: The events of the run by tick, then its outcome.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -78,29 +93,22 @@ class Recording:
             is_flight = (folder / STRETCHES).is_dir()
             if mend(folder) and not is_flight:
                 _note(
-                    f"{folder}: its recorder was killed; what it had taken is in cycles.parquet and"
-                    " signals"
+                    f"{folder}: its recorder was killed; the rows it had taken are now in"
+                    " cycles.parquet and signals"
                 )
         self._there(CHECKSUMS)
         self.checksums = Checksums(folder)
         self.checksums.verify(CONFIG)
         self.config = self._text(CONFIG)
-        """The resolved config, as TOML text."""
         path = self._there(CYCLES)
         self._cycles = self._opened(path, ("task", *FIELDS))
         with _naming(path):
             metadata = self._cycles.metadata.metadata
             self.layout = layout_of(json.loads(metadata[b"layout"]))
-            """The rack's layout."""
             self.launch = Launch(*json.loads(metadata[b"launch"]))
-            """When the rack was launched."""
             self.cores = CoreRecord.of(metadata[b"cores"])
-            """What the machine did to its cores; empty if the recorder did not measure it, or was
-            killed."""
             kept = [tuple(ends) for ends in json.loads(metadata[b"kept"])]
             self.kept: list[tuple[int, int]] = [] if len(kept) == 1 and kept[0][0] == 0 else kept
-            """The ticks of the stretches that a flight recorder kept, [first, end); none if it
-            removed nothing."""
             self._gaps = json.loads(metadata[b"gaps"])
             self._lost_before_the_end = dict[str, int](json.loads(metadata[b"lost"]))
         self._shapes = {
@@ -109,11 +117,10 @@ class Recording:
         }
         self._tables = {box.name: self._parts(box.name) for box in self.layout.timed}
         self.events = self._read_events()
-        """The events of the run by tick, then its outcome."""
 
     @cached_property
     def rack_config(self) -> RackConfig:
-        """The resolved config. Raises `Failure` with every mistake in it."""
+        """The resolved config. Raises `Failure` with all of its mistakes."""
         try:
             return read_stored(self.config)
         except ConfigError as error:
@@ -121,9 +128,7 @@ class Recording:
             raise Failure(f"{self.folder / 'config.toml'}: {mistakes}", 2) from None
 
     def adopt_kinds(self) -> None:
-        """Let this process know the kinds of faults that the rack's own levels add. Raises
-        `Failure`.
-        """
+        """Register the fault kinds that the rack's own levels define. Raises `Failure`."""
         path = self.folder / PUBLISHED
         if path.exists():
             self.checksums.verify(PUBLISHED)
@@ -131,26 +136,27 @@ class Recording:
                 PublishedRack.read(self._text(PUBLISHED))
 
     def _parts(self, mailbox: str) -> list[pq.ParquetFile]:
-        """Return the parts of a mailbox's table, oldest first."""
+        """Open the parts of a mailbox's table, oldest first."""
         path = self._there(f"{SIGNALS}/{TABLE.format(mailbox)}")
         with _naming(path):
             count = max(len([*path.iterdir()]), 1)
         parts = [path / PART.format(number) for number in range(1, count + 1)]
-        if absent := [part.name for part in parts if not part.exists()]:
-            raise Failure(f"{path}: {absent[0]} is missing", 2)
+        if missing := [part.name for part in parts if not part.exists()]:
+            raise Failure(f"{path}: {missing[0]} is missing", 2)
         return [self._opened(part, (*HEAD, *self._shapes[mailbox])) for part in parts]
 
     def _opened(self, path: Path, columns: Iterable[str]) -> pq.ParquetFile:
-        """Return an undamaged parquet file that has these columns. Raises `Failure`."""
+        """Open an undamaged parquet file that has these columns. Raises `Failure`."""
         self.checksums.verify(str(path.relative_to(self.folder)))
         with _naming(path):
             file = pq.ParquetFile(path, page_checksum_verification=True)
         names = file.schema_arrow.names
-        if absent := [column for column in columns if column not in names]:
-            raise Failure(f"{path}: not a recording of a rack: it has no column '{absent[0]}'", 2)
+        if missing := [column for column in columns if column not in names]:
+            raise Failure(f"{path}: not a recording of a rack: it has no column '{missing[0]}'", 2)
         return file
 
     def _text(self, name: str) -> str:
+        """Read a text file of the run. Raises `Failure`."""
         path = self._there(name)
         try:
             return read_file(path).decode()
@@ -160,40 +166,45 @@ class Recording:
             ) from None
 
     def _there(self, name: str) -> Path:
+        """Return the path of a file that every run has. Raises `Failure` if it is missing."""
         if not (self.folder / name).exists():
             raise Failure(f"{self.folder}: not a run: it has no {name}", 2)
         return self.folder / name
 
     def _read_events(self) -> list[Document]:
+        """Read the events of the run, if any were recorded, sorted by tick."""
         path = self.folder / EVENTS
         if not path.exists():
             return []
         *lines, last = self._text(EVENTS).split("\n")
         if last and is_cut_off(last):
-            # A run that was killed leaves half a line.
+            # A killed run can leave an incomplete last line.
             _note(f"{path}: line {len(lines) + 1} is cut off, and left out")
         elif last:
             lines.append(last)
-        found = (_event(line, f"{path}: line {number}") for number, line in enumerate(lines, 1))
-        return sorted(found, key=order_key)
+        events = (_event(line, f"{path}: line {number}") for number, line in enumerate(lines, 1))
+        return sorted(events, key=order_key)
 
     @cached_property
     def ended(self) -> Document:
-        """Counts at the end of the run, as in `rack.tools.launch.launch.RunResult`. Empty if they
-        are not recorded.
+        """Counts at the end of the run, as in `rack.tools.launch.launch.RunResult`.
+
+        Empty if the end was not recorded.
         """
         return next((event for event in self.events if event["kind"] == "outcome"), {})
 
     @property
     def lost(self) -> dict[str, int]:
-        """Rows that were written and are not in the files, by task and by mailbox."""
+        """Number of rows that were written but are not in the files, by task and by mailbox."""
         return dict(self.ended.get("rows_lost", self._lost_before_the_end))
 
     def stretch_of(self, ticks: np.ndarray) -> np.ndarray:
-        """Return the number of the stretch of each tick, shape (n,): what lies between two of them
-        is unknown. All are of one where everything was kept.
+        """Return the number of the kept stretch in which each tick lies, shape (n,).
+
+        Nothing is known between two stretches. If everything was kept, all ticks are in stretch 0.
         """
-        # Some rows are later than the end of their stretch, or of releases before its begin.
+        # Rows may lie slightly outside their stretch, so the borders are in the gaps: halfway, but
+        # at most one second after the earlier stretch.
         second = round(1e9 / self.layout.clock_ns)
         borders = [
             end + min((first - end) // 2, second) for (_, end), (first, _) in pairwise(self.kept)
@@ -202,7 +213,7 @@ class Recording:
 
     @property
     def kept_text(self) -> str:
-        """It as text; empty if nothing was removed."""
+        """Sentence that says which stretches were kept, or "" if everything was kept."""
         tick_s = self.layout.clock_ns * 1e-9
         spans = [f"{first * tick_s:.1f} s to {end * tick_s:.1f} s" for first, end in self.kept]
         more = [f"{len(spans) - SHOWN} more stretches"] if len(spans) > SHOWN else []
@@ -210,38 +221,40 @@ class Recording:
         return f"kept {text}; the rest was not kept, as [record] keep says" if text else ""
 
     def gaps(self, lost: Mapping[str, int] | None = None, ticks: int | None = None) -> list[Gap]:
-        """Return where rows are missing, in order; gaps that overlap are one.
+        """Find the places where rows are missing, in order. Overlapping gaps are merged.
 
-        `lost` (default: as known at the end) counts them by ring, for a run of `ticks`: what the
-        files do not know of was lost after their last row.
+        Args:
+            lost: Number of lost rows, by ring. Defaults to the counts at the end of the run.
+            ticks: Length of the run. Defaults to its recorded length. Rows that the files do not
+                report as lost were lost between their last row and this tick.
         """
         lost = self.lost if lost is None else lost
         ticks = self.ended.get("outcome", {}).get("ticks", 0) if ticks is None else ticks
-        found = list(self._gaps)
+        gaps = list(self._gaps)
         for name, count in lost.items():
             if count > self._lost_before_the_end.get(name, 0):
-                found.append((name, self._last_tick(name) + 1, ticks - 1))
+                gaps.append((name, self._last_tick(name) + 1, ticks - 1))
         merged: list[Gap] = []
-        # A row of the last tick itself may be missing: there is no tick after it.
+        # If only the row of the last tick is missing, `first` is after `last`.
         for ring, first, last in sorted(
-            ((name, min(first, last), last) for name, first, last in found), key=lambda gap: gap[1]
+            ((name, min(first, last), last) for name, first, last in gaps), key=lambda gap: gap[1]
         ):
             if merged and first <= merged[-1].last + 1:
-                before = merged.pop()
-                rings = tuple(dict.fromkeys((*before.rings, ring)))
-                merged.append(Gap(before.first, max(before.last, last), rings))
+                previous = merged.pop()
+                rings = tuple(dict.fromkeys((*previous.rings, ring)))
+                merged.append(Gap(previous.first, max(previous.last, last), rings))
             else:
                 merged.append(Gap(first, last, (ring,)))
         return merged
 
     def _last_tick(self, name: str) -> int:
-        """Return the tick of the newest row of a task or mailbox; -1 if there is none."""
+        """Return the tick of the newest row of a task or mailbox, or -1 if it has none."""
         if name in self.cycles:
             return int(self.cycles[name]["tick"][-1])
         return int(self.signal(name, "tick")[-1]) if name in self.mailboxes else -1
 
     def untraced(self) -> dict[str, tuple[int, int]]:
-        """Return the tasks with cycles that are not recorded: how many are, and of how many."""
+        """Return recorded and total number of cycles, for tasks with missing trace records."""
         traced = {task.name: len(self.trace(task.name)) for task in self.layout.tasks}
         return {
             name: (rows, rows + self.lost[name])
@@ -250,8 +263,13 @@ class Recording:
         }
 
     def missing(self, segment: Segment) -> dict[str, Missing]:
-        """Return what the files lack of the rings of a rack that has ended, by task and by
-        mailbox.
+        """Count the rows that the files lack of the rings of a rack that has ended.
+
+        Args:
+            segment: Segment of the rack.
+
+        Returns:
+            The missing rows by task and by mailbox.
         """
         taken = {}
         lost = dict(self.lost)
@@ -261,16 +279,14 @@ class Recording:
             else:
                 serials = self.signal(name, "serial")
                 taken[name] = int(serials[-1]) if len(serials) else ring.before
-                # Messages that every reader rejects are absent and not lost; those lost last are
-                # overwritten.
+                # Rows missing before the last serial were lost or skipped as damaged. Count only
+                # lost ones, and not those lost after the last row, which the ring reports itself.
                 lost[name] = min(lost[name], taken[name] - ring.before - len(serials))
         return find_missing(segment, taken, lost)
 
     @cached_property
     def cycles(self) -> dict[str, np.ndarray]:
-        """The trace by task: structured rows, oldest first, with the fields of
-        `rack.backplane.trace.RECORD`.
-        """
+        """The trace by task: records of type `rack.backplane.trace.RECORD`, oldest first."""
         with _naming(self.folder / CYCLES):
             table = self._cycles.read()
             tasks = table["task"].to_numpy()
@@ -280,64 +296,69 @@ class Recording:
         return {str(task): rows[tasks == task] for task in dict.fromkeys(tasks)}
 
     def counts(self, task: str) -> Document:
-        """Return the counts of a task at the end of the run; empty where they are not recorded."""
+        """Return the counts of a task at the end of the run. Empty if the end was not recorded."""
         return dict(self.ended.get("tasks", {}).get(task, {}))
 
     def place(self, task: TaskSpec) -> tuple[int, int]:
-        """Return core and priority that a task obtained; those of the config where the run's end is
-        not recorded.
+        """Return the core and the priority that a task obtained.
+
+        If the end of the run was not recorded, these are the settings of its config.
         """
         counted = self.counts(task.name)
         return counted.get("core", task.core), counted.get("priority", task.priority)
 
     def trace(self, task: str) -> np.ndarray:
-        """Return the trace of a task, as in `cycles`; empty for a task that left none."""
+        """Return the trace of a task, as in `cycles`. Empty for a task without trace records."""
         return self.cycles.get(task, np.empty(0, dtype=RECORD))
 
     def signal(self, mailbox: str, field: str) -> np.ndarray:
-        """Return one field of every message of a mailbox, oldest first, shape (messages, *shape of
-        the field).
+        """Return one field of all messages of a mailbox.
 
-        "serial", "tick", "visible_at", "basis", "stamp_ns" and "chain" are fields of every mailbox;
-        a field of its own with such a name is "message.<name>". Raises `KeyError`.
+        Args:
+            mailbox: The mailbox.
+            field: Name of the field. Every mailbox has the fields "serial", "tick", "visible_at",
+                "basis", "stamp_ns" and "chain"; a message's own field of such a name is
+                "message.<name>".
+
+        Returns:
+            Values, oldest first, shape (messages, *shape of the field).
+
+        Raises:
+            KeyError: The messages have no such field.
         """
         shape = () if field in HEAD else self._shapes[mailbox][field]
         with _naming(self.folder / SIGNALS / TABLE.format(mailbox)):
-            read = [file.read(columns=[field]) for file in self._tables.get(mailbox, ())]
-        if not any(map(len, read)):
+            tables = [file.read(columns=[field]) for file in self._tables.get(mailbox, ())]
+        if not any(map(len, tables)):
             return np.empty((0, *shape))
-        column = pa.concat_tables(read).column(0).combine_chunks()
+        column = pa.concat_tables(tables).column(0).combine_chunks()
         values = column.flatten() if shape else column
         return np.asarray(values.to_numpy(zero_copy_only=False).reshape(-1, *shape))
 
     def reason(self, mailbox: str, row: int) -> str:
-        """Return the reason in a status, for people; empty for one of a user's level without
-        one.
-        """
+        """Return the reason in a status as printable text, or "" if the status has none."""
         has_reason = "reason" in self.fields(mailbox)
         return printable(str(self.signal(mailbox, "reason")[row])) if has_reason else ""
 
     def rows(self, name: str) -> np.ndarray:
-        """Return what a recorder took from a ring, oldest first: trace records of a task, or
-        messages of a mailbox.
-        """
+        """Return the recorded rows of a ring, oldest first: trace records or rows of a mailbox."""
         if name in self.cycles:
             return self.cycles[name]
         box = self.layout.mailbox(name)
-        found = np.zeros(len(self.signal(name, "tick")), row_dtype(box))
+        rows = np.zeros(len(self.signal(name, "tick")), row_dtype(box))
         for field in HEAD:
-            found[field] = self.signal(name, field)
+            rows[field] = self.signal(name, field)
         for column in columns_of(box):
-            column.values(found["message"])[...] = self.signal(name, column.label)
-        return found
+            column.values(rows["message"])[...] = self.signal(name, column.label)
+        return rows
 
     def fields(self, mailbox: str) -> set[str]:
-        """Return the fields of a mailbox's messages."""
+        """Return the names of all fields of a mailbox's messages."""
         return {*self._shapes[mailbox]}
 
     @property
     def mailboxes(self) -> list[str]:
-        """The mailboxes that hold messages."""
+        """Mailboxes from which at least one message was recorded."""
         tables = self._tables.items()
         return [name for name, parts in tables if any(part.metadata.num_rows for part in parts)]
 
@@ -354,8 +375,10 @@ def _naming(path: Path) -> Iterator[None]:
 
 
 def _event(line: str, place: str) -> Document:
-    """Return an event from its line, as `read_line` does. Raises `Failure`, which names the
-    place.
+    """Parse a line of events.jsonl.
+
+    Raises:
+        Failure: The line is damaged or no event. The message begins with `place`.
     """
     try:
         event = read_line(line)
@@ -370,4 +393,5 @@ def _event(line: str, place: str) -> Document:
 
 
 def _note(text: str) -> None:
+    """Print a note for the user on stderr."""
     print(text, file=sys.stderr)

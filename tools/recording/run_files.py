@@ -1,6 +1,4 @@
-"""What a recorder leaves in the folder of a run: cycles.parquet and signals/, made as rows come, or
-later from its spool.
-"""
+"""The files with the rows of a run, cycles.parquet and signals/, written live or from a spool."""
 
 from __future__ import annotations
 
@@ -41,13 +39,13 @@ TABLES = (CYCLES, f"{SIGNALS}/*/*")
 EVENTS = "events.jsonl"
 MENDED = "-mended"
 POLL_S = 0.2
-"""Time between two attempts to lock the spool of a recorder that finishes."""
+"""Time between two attempts to lock the spool of a recorder that is finishing."""
 FINISH_S = 20.0
-"""Longest wait for a recorder that finishes without its launcher."""
+"""Longest time to wait for a recorder that finishes after its launcher has gone."""
 
 
 class Missing(NamedTuple):
-    """Rows of a ring that a recording lacks, of how many that were written."""
+    """Number of rows of a ring that a recording lacks, and number of rows written to that ring."""
 
     rows: int
     written: int
@@ -56,32 +54,36 @@ class Missing(NamedTuple):
 def find_missing(
     segment: Segment, taken: Mapping[str, int], lost: Mapping[str, int]
 ) -> dict[str, Missing]:
-    """Return what a recording lacks of the rings of a rack that has ended.
+    """Count the rows that a recording lacks of the rings of a rack that has ended.
 
     Args:
-        segment: The rack.
-        taken: Number of the last record that was taken, by ring.
-        lost: Number of rows before it that are not in the recording, by ring.
+        segment: Segment of the rack.
+        taken: Number of the last record taken from each ring.
+        lost: Number of earlier rows that are not in the recording, by ring.
 
     Returns:
-        The rows missing, by task and by mailbox.
+        The missing rows by task and by mailbox. Complete rings are left out.
     """
-    found = {}
+    missing = {}
     for name, ring in rings(segment).items():
         ring.resume(taken[name])
         written = taken[name] - ring.before + ring.waiting
         left, overwritten = ring.drain()
         if rows := lost[name] + overwritten + len(left):
-            found[name] = Missing(rows, written)
-    return found
+            missing[name] = Missing(rows, written)
+    return missing
 
 
 class Tally:
-    """What a recorder has taken of a rack's rings, or left of it on disk.
+    """Counts of the rows that a recorder has taken from a rack's rings.
 
-    By ring, `lost` counts the rows lost, `rows` those taken, and `taken` is the number of its last
-    record so far, from `before` on. `kept` holds the ticks of the stretches that a flight recorder
-    kept, [first, end).
+    Attributes:
+        tasks: Names of the tasks, whose rings are traces.
+        lost: Number of lost rows, by ring.
+        taken: Number of the last record taken, by ring. Starts at `before`.
+        rows: Number of rows taken, by ring.
+        kept: Ticks of the stretches that a flight recorder kept, [first, end).
+        number: Number of the newest stretch.
     """
 
     def __init__(self, layout: Layout, before: Mapping[str, int] | None = None) -> None:
@@ -95,7 +97,7 @@ class Tally:
         self._newest = -1
 
     def take(self, part: Part) -> None:
-        """Take what is in a spool."""
+        """Count the content of one part of a spool."""
         match part:
             case StretchHead():
                 self.begin(part)
@@ -106,10 +108,10 @@ class Tally:
                     self.add(*block)
 
     def begin(self, stretch: StretchHead) -> None:
-        """Go on with a stretch; others before it may have been removed."""
+        """Begin a stretch. Stretches before it may have been removed."""
         follows = stretch.number == self.number + 1
         if follows:
-            # Rows are missing only if the file before is damaged.
+            # The counts disagree only if the file of the previous stretch is damaged.
             for name, rows in stretch.rows.items():
                 self.lost[name] += rows - self.rows[name]
         self.taken.update(stretch.taken)
@@ -122,31 +124,44 @@ class Tally:
         self.number = stretch.number
 
     def add(self, name: str, rows: np.ndarray, lost: int) -> None:
-        """Add rows of a ring, and count those lost before them."""
+        """Count rows of a ring.
+
+        Args:
+            name: The ring.
+            rows: The rows, shape (rows,).
+            lost: Number of rows lost before them.
+        """
         self.count(name, len(rows), lost)
         if len(rows):
             self._newest = int(rows["tick"][-1])
             if name not in self.tasks:
-                # Messages that every reader rejects were left out.
+                # The recorder skips damaged messages, so counting rows would fall behind.
                 self.taken[name] = int(rows["serial"][-1])
 
     def count(self, name: str, rows: int, lost: int) -> None:
-        """Count rows of a ring, and those lost before them."""
+        """Add to the counts of a ring.
+
+        Args:
+            name: The ring.
+            rows: Number of rows taken.
+            lost: Number of rows lost before them.
+        """
         self.lost[name] += lost
         self.rows[name] += rows
         self.taken[name] += lost + rows
 
     def end(self, tick: int = OPEN) -> None:
-        """End the last stretch at a tick, or else where its recorder was killed."""
+        """End the last stretch at a tick, or after its newest row if its recorder was killed."""
         if self.kept and self.kept[-1][1] == OPEN:
             first = self.kept[-1][0]
             self.kept[-1] = first, max(first, self._newest + 1) if tick == OPEN else tick
 
 
 class RunFiles(Tally):
-    """cycles.parquet and signals/ of a folder, being written.
+    """Writer of cycles.parquet and signals/ in the folder of a run.
 
-    `gaps` holds where rows were lost: ring, first and last tick without rows.
+    Attributes:
+        gaps: Places where rows were lost: ring, first and last tick without rows.
     """
 
     def __init__(
@@ -160,18 +175,24 @@ class RunFiles(Tally):
         super().__init__(layout, before)
         self.gaps: list[tuple[str, int, int]] = []
         self._reached = dict.fromkeys(self.lost, (-1, 0))
-        """Of each ring the newest tick, and the rows lost by then."""
+        """Newest tick of each ring, and the number of rows lost up to that tick."""
         self._cycles = CyclesFile(folder / f"{CYCLES}{suffix}", layout, launch)
         self._signals = signal_tables(folder / f"{SIGNALS}{suffix}", layout)
 
     def begin(self, stretch: StretchHead) -> None:
-        """Go on with a stretch: what is not there before it was removed, not lost."""
+        """Begin a stretch. Rows between it and an earlier one were removed, not lost."""
         if stretch.number != self.number + 1:
             self._reached = {name: (stretch.begin - 1, lost) for name, lost in self.lost.items()}
         super().begin(stretch)
 
     def add(self, name: str, rows: np.ndarray, lost: int) -> None:
-        """Add rows of a ring, and count those lost before them."""
+        """Write rows of a ring, and note the gap if rows were lost before them.
+
+        Args:
+            name: The ring.
+            rows: The rows, shape (rows,).
+            lost: Number of rows lost before them.
+        """
         super().add(name, rows, lost)
         if len(rows):
             tick, before = self._reached[name]
@@ -184,7 +205,7 @@ class RunFiles(Tally):
             self._signals[name].add(rows)
 
     def close(self, cores: CoreRecord = UNMEASURED) -> None:
-        """Finish all files; the trace keeps what the machine did to its cores."""
+        """Finish all files, and store the steal and frequencies of the cores with the trace."""
         self.end()
         for table in self._signals.values():
             table.close()
@@ -192,10 +213,13 @@ class RunFiles(Tally):
 
 
 def mend(folder: Path) -> bool:
-    """Make the files from the spool that a killed recorder left, or a flight recorder; return False
-    where there is none.
+    """Build the files of a run from the spool of a killed recorder or of a flight recorder.
 
-    Raises `Failure` when that recorder is still running, or its spool cannot be read.
+    Returns:
+        False if the folder holds no spool.
+
+    Raises:
+        Failure: The recorder is still running, or its spool cannot be read.
     """
     path = folder / SPOOL
     if not path.is_file():
@@ -203,56 +227,62 @@ def mend(folder: Path) -> bool:
     with path.open("rb") as file:
         _lock(file, path)
         if not path.is_file():
-            # The recorder has finished its files meanwhile.
+            # The recorder finished its files while this process waited for the lock.
             return False
         layout, launch = read_head(file, path)
         files = RunFiles(folder, layout, launch, MENDED)
         for part in read(file, folder):
             files.take(part)
-        # Still locked: another process that opens this run waits until the files are in place.
+        # Keep the lock, so that another process that opens this run waits for the files.
         files.close()
         rmtree(folder / SIGNALS, ignore_errors=True)
         for name in (CYCLES, SIGNALS):
             (folder / f"{name}{MENDED}").replace(folder / name)
         Checksums(folder).store(*TABLES)
-        # First: without it what is left of the stretches is not taken for a run.
+        # Remove the spool first: without it, leftover stretches are not mistaken for a run.
         path.unlink()
         rmtree(folder / STRETCHES, ignore_errors=True)
     return True
 
 
 def tally(folder: Path) -> Tally | None:
-    """Return what a flight recorder has left in a folder, by the counts of its frames;
-    None where none has. Raises `Failure` when it cannot be read.
+    """Count what a flight recorder has left in a folder, without unpacking its rows.
+
+    Returns:
+        The counts, or None if the folder holds no flight recorder's spool.
+
+    Raises:
+        Failure: The spool cannot be read.
     """
     path = folder / SPOOL
     if not path.is_file() or not (folder / STRETCHES).is_dir():
         return None
     with path.open("rb") as file:
         layout, _ = read_head(file, path)
-        found = Tally(layout)
+        counted = Tally(layout)
         for part in read(file, folder):
             if isinstance(part, Frame):
                 for counts in part.counts:
-                    found.count(*counts)
+                    counted.count(*counts)
             else:
-                found.take(part)
-    found.end()
-    return found
+                counted.take(part)
+    counted.end()
+    return counted
 
 
 def _lock(file: IO[bytes], path: Path) -> None:
-    """Lock a spool; where its launcher was killed, wait for its recorder to finish."""
+    """Lock a spool, waiting for a recorder that is finishing without its launcher."""
     deadline = time.monotonic() + FINISH_S
     while not locked(file):
         if _is_running(*read_head(file, path)):
-            raise Failure(f"{path}: another recorder is running there")
+            raise Failure(f"{path}: another recorder is still writing it")
         if time.monotonic() > deadline:
-            raise Failure(f"{path}: its recorder has not finished within {FINISH_S:g} s")
+            raise Failure(f"{path}: its recorder did not finish within {FINISH_S:g} s")
         time.sleep(POLL_S)
 
 
 def _is_running(layout: Layout, launch: Launch) -> bool:
+    """Return True if the rack of this launch has a segment and its run is not over."""
     with suppress(SegmentError), closing(Segment.attach(layout.rack)) as segment:
         return segment.launch == launch and not segment.run_is_over
     return False

@@ -1,19 +1,19 @@
-"""The files of a recording, and the spool that makes them safe: a parquet file is readable only
-once its footer, written last, is there.
+"""The spool, which protects a recording: a parquet file is unreadable until its footer is written.
 
-The rows of all rings also go to `recorder.spool` as they are, compressed, about ten times a second:
-a line of JSON with its own checksum each time, as in events.jsonl. A restarted recorder continues
-from the spool; `mend` makes the parquet files from the spool of a recorder that is gone. The spool
-is removed when the files are complete. A truncated last line is dropped; any other damage is an
-error. The rings hold two seconds, so a recorder that is back within that time loses nothing.
+About ten times a second the recorder appends the rows of all rings, compressed, to
+`recorder.spool`. Each append is a line of JSON with its own checksum, as in events.jsonl. A
+restarted recorder continues from the spool, and `rebuild_files` makes the parquet files from the
+spool of a recorder that is gone. The spool is removed when the files are complete. A truncated last
+line is dropped; any other damage is an error. The rings hold two seconds, so a recorder that is
+back within that time loses nothing.
 
 Arrow's IPC streams were rejected: a stream of columns for each ring takes six times the processor
-time, and no stream has checksums, so that damage could be read as other values.
+time, and streams have no checksums, so damaged data could be read as other values.
 
-A flight recorder (`[record] keep`) writes no parquet files: frames go to stretches, files that are
-removed again unless something happened near them. The head of each says what was taken before it,
-so the tables can be made from any of them. They are made when the run is opened: ten minutes of the
-NASREM rack take 20 s.
+A flight recorder (`[record] keep`) writes no parquet files. Its frames go to files called
+stretches, which are removed again unless something happened near them. The head of each stretch
+contains the counts of everything before it, so the tables can be made from any of them. That
+happens when the run is opened; ten minutes of the NASREM rack take 20 s.
 """
 
 from __future__ import annotations
@@ -45,15 +45,18 @@ from rack.tools.recording.checksums import (
 from rack.tools.recording.file_names import CODE, CONFIG, ORIGIN, SPOOL
 
 FLUSH_S = 0.1
-"""SIGKILL of all processes loses what boards wrote in this time, between two drains, and in one or
-two passes of the recorder, which last longer on a busy machine."""
+"""Time between two writes of the spool.
+
+SIGKILL of all processes loses what boards wrote during this time, between two drains, and during
+one or two passes of the recorder, which last longer on a busy machine.
+"""
 STRETCHES = "stretches"
 OPEN = -1
-"""End of a stretch that is being written, or whose recorder was killed."""
+"""End of a stretch that is still being written, or whose recorder was killed."""
 
 
 class SpoolHead(NamedTuple):
-    """The first line of a spool: the rack's layout as plain data, and its launch."""
+    """First line of a spool: the rack's layout as plain data, and its launch."""
 
     layout: Any
     launch: Launch
@@ -64,17 +67,17 @@ class Frame(NamedTuple):
 
     Attributes:
         counts: Blocks of rows: ring, number of rows, and number of rows lost before them.
-        data: All the rows, block after block, compressed, as base64.
+        data: Rows of all blocks in order, compressed, as base64.
     """
 
     counts: list[tuple[str, int, int]]
     data: str
 
     def unpack(self, dtypes: Mapping[str, np.dtype]) -> Iterator[tuple[str, np.ndarray, int]]:
-        """Yield the blocks.
+        """Yield the blocks of rows.
 
         Args:
-            dtypes: Row type of every ring, from `ring_dtypes`.
+            dtypes: Row type of every ring, from `list_ring_dtypes`.
 
         Yields:
             Ring, rows, shape (rows,), and number of rows lost before them.
@@ -88,10 +91,13 @@ class Frame(NamedTuple):
 
 
 class StretchHead(NamedTuple):
-    """The head of a stretch: its number from 1, and what its recorder had taken before it.
+    """First line of a stretch.
 
-    It holds what ended from tick `begin` on. By ring, `taken` is the number of the last record
-    before it, and `rows` counts the rows.
+    Attributes:
+        number: Number of the stretch, from 1.
+        begin: The stretch holds rows of cycles that ended from this tick on.
+        taken: Number of the last record taken before it, by ring.
+        rows: Number of rows taken before it, by ring.
     """
 
     number: int
@@ -101,8 +107,10 @@ class StretchHead(NamedTuple):
 
 
 class StretchEnd(NamedTuple):
-    """The last line of a stretch, which holds what ended before this tick; a recorder that was
-    killed leaves none.
+    """Last line of a stretch, which a killed recorder does not write.
+
+    Attributes:
+        tick: The stretch holds rows of cycles that ended before this tick.
     """
 
     tick: int
@@ -113,15 +121,15 @@ KINDS = {kind.__name__: kind for kind in (SpoolHead, StretchHead, Frame, Stretch
 
 
 class Spool:
-    """The spool of a folder, open for writing; continues one that another recorder left, after
-    `resume`.
+    """The spool of a folder, open for writing.
 
-    Raises `Failure` when another recorder has it open, or it belongs to another rack.
+    To continue the spool of another recorder, call `read_rest` first. Raises `Failure` if another
+    recorder has it open, or if it belongs to another launch or rack.
     """
 
     def __init__(self, folder: Path, layout: Layout, launch: Launch) -> None:
         self.path = folder / SPOOL
-        # Unbuffered: the kernel has at once whatever is written.
+        # Unbuffered, so that the kernel has everything that was written if this process is killed.
         self._file = self.path.open("ab", buffering=0)
         self._out: IO[bytes] = self._file
         self._folder = folder
@@ -129,23 +137,24 @@ class Spool:
         self._flush_at = 0.0
         try:
             if not locked(self._file):
-                raise Failure(f"{self.path}: another recorder is running there")
+                raise Failure(f"{self.path}: another recorder is still writing it")
             if not self.path.stat().st_size:
-                # The config and the origin of the run are written before its recorder begins.
+                # The launcher has written these files before it starts the recorder.
                 Checksums(folder).store(CONFIG, ORIGIN, CODE)
                 _write(self._file, SpoolHead(asdict(layout), launch))
             with self.path.open("rb") as left:
-                found = read_head(left, self.path)
-            if found != (layout, launch):
+                recorded_head = read_head(left, self.path)
+            if recorded_head != (layout, launch):
                 raise Failure(
-                    f"{self.path}: holds a recording of another launch or rack, '{found[0].rack}'"
+                    f"{self.path}: holds a recording of another launch or rack,"
+                    f" '{recorded_head[0].rack}'"
                 )
         except BaseException:
             self.close()
             raise
 
     def resume(self) -> Iterator[Part]:
-        """Yield what another recorder left, and continue after it."""
+        """Yield the parts that another recorder left, then cut off a damaged last line."""
         with self.path.open("rb") as left:
             read_head(left, self.path)
             whole = left.tell()
@@ -153,12 +162,19 @@ class Spool:
                 yield part
                 whole = left.tell()
         self._file.truncate(whole)
-        # What was taken before a stretch is in its head. That of the newest one may be cut off.
+        # The head of a stretch contains all counts before it. The newest head may be cut off, so
+        # read the last two stretches.
         yield from _read_stretches(stretch_files(self._folder)[-2:])
 
     def divert(self, stretch: StretchHead, end: int) -> Path:
-        """Finish the stretch that is being written, which ends at a tick, and write what is added
-        from now on into another; return its file.
+        """Finish the current stretch at a tick, and write into a new stretch from now on.
+
+        Args:
+            stretch: Head of the new stretch.
+            end: Tick at which the current stretch ends.
+
+        Returns:
+            File of the new stretch.
         """
         self.flush(now=True)
         self._finish_stretch(end)
@@ -169,19 +185,34 @@ class Spool:
         return path
 
     def _finish_stretch(self, end: int) -> None:
+        """Close the file of the current stretch, if any, and mark its end if the end is known."""
         if self._out is not self._file:
             if end != OPEN:
                 _write(self._out, StretchEnd(end))
             self._out.close()
 
     def add(self, ring: str, rows: np.ndarray, lost: int) -> None:
-        """Add rows from a ring."""
+        """Queue rows of a ring for the next flush.
+
+        Args:
+            ring: The ring.
+            rows: The rows, shape (rows,).
+            lost: Number of rows lost before them.
+        """
         if len(rows) or lost:
             self._waiting.append((ring, rows, lost))
 
     def flush(self, now: bool = False) -> bool:
-        """Write what waits, when it is due or `now`; return whether it did. Raises `OSError` when
-        the disk is full.
+        """Write the queued rows if a write is due.
+
+        Args:
+            now: Whether to write in any case.
+
+        Returns:
+            True if the queue was written.
+
+        Raises:
+            OSError: The disk is full.
         """
         if not now and time.monotonic() < self._flush_at:
             return False
@@ -195,27 +226,29 @@ class Spool:
         return True
 
     def remove(self) -> None:
-        """Remove the spool: the parquet files are complete."""
+        """Delete the spool, once the parquet files are complete."""
         self.path.unlink()
         self.close()
 
     def close(self, end: int = OPEN) -> None:
-        """Close the spool and leave it to another recorder; its stretch, if any, ends at a tick."""
+        """Close the spool so that another recorder can continue it. Its stretch ends at `end`."""
         self._finish_stretch(end)
         self._file.close()
 
 
 def _write(file: IO[bytes], part: SpoolHead | Part) -> None:
-    """Write a line to an unbuffered file. Raises `OSError` when the disk is full."""
+    """Write a part as a line to an unbuffered file. Raises `OSError` if the disk is full."""
     line = checked_line({type(part).__name__: part}).encode()
     while line:
-        # It may take a part at a time.
+        # An unbuffered write may accept only part of the data.
         line = line[file.write(line) :]
 
 
 def _read_parts(file: IO[bytes], path: Path) -> Iterator[Any]:
-    """Yield what the lines of a spool or stretch hold, up to the last whole one. Raises `Failure`
-    for a damaged line.
+    """Yield the parts of a spool or stretch, up to the last complete line.
+
+    Raises:
+        Failure: A line is damaged.
     """
     while line := file.readline().decode(errors="replace"):
         is_whole = line.endswith("\n")
@@ -231,21 +264,22 @@ def _read_parts(file: IO[bytes], path: Path) -> Iterator[Any]:
 
 
 def read_head(file: IO[bytes], path: Path) -> tuple[Layout, Launch]:
-    """Return what the head of a spool says of the rack; its frames follow. Raises `Failure`."""
+    """Read layout and launch at the start of a spool. Its frames follow. Raises `Failure`."""
     file.seek(0)
     head = next(_read_parts(file, path), None)
     if head is None:
-        raise Failure(f"{path}: truncated before its first row", 2)
+        raise Failure(f"{path}: it ends before its first row", 2)
     return layout_of(head.layout), Launch(*head.launch)
 
 
 def read(file: IO[bytes], folder: Path) -> Iterator[Part]:
-    """Yield the frames of a spool, which is open after its head, then its stretches with theirs."""
+    """Yield the parts of a spool that is open after its head, then the parts of its stretches."""
     yield from _read_parts(file, folder / SPOOL)
     yield from _read_stretches(stretch_files(folder))
 
 
 def _read_stretches(paths: Iterable[Path]) -> Iterator[Part]:
+    """Yield the parts of these stretches."""
     for path in paths:
         check_file(path)
         with path.open("rb") as file:
@@ -253,7 +287,7 @@ def _read_stretches(paths: Iterable[Path]) -> Iterator[Part]:
 
 
 def stretch_files(folder: Path) -> list[Path]:
-    """Return the files of the stretches in a folder, oldest first."""
+    """List the files of the stretches in a folder, oldest first."""
     return sorted((folder / STRETCHES).glob("*.spool"))
 
 
@@ -272,7 +306,7 @@ def ring_dtypes(layout: Layout) -> dict[str, np.dtype]:
 
 
 def locked(file: IO[bytes]) -> bool:
-    """Lock a file; return False if another process has locked it."""
+    """Try to lock a file. Returns False if another process has locked it."""
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

@@ -1,11 +1,12 @@
-"""What took the cores of a rack in real time: the hypervisor by the kernel's count, or without one,
-or a host's quota.
+"""Detect what took the cores away from a rack that ran in real time.
 
-A host that takes a core away need not count that as steal. It then shows where the rack was due and
-left no stamp: the clock's board, which preempts all else on its core, woke late (its own
-`CLOCK_LATE`); or a task was due on another core and no task left a stamp there. Both must have a
-real-time priority: without one they wait for any program. Alternative considered: a trace of the
-clock. It shows no more, and needs a ring of its own.
+The causes are the hypervisor, with or without steal in the kernel's counts, and a quota of the
+host. A host that takes a core away need not count that as steal. The absence then shows as a time
+at which the rack was due but recorded no time stamp. On the clock's core the clock, which preempts
+everything else, woke late (event `CLOCK_LATE`). On any other core a task was due and no task
+recorded a stamp. Both count only with a real-time priority, because without it a task waits for any
+program. Alternative considered: a trace of the clock board, which would show no more but need a
+ring.
 """
 
 from __future__ import annotations
@@ -23,22 +24,28 @@ from rack.tools.console.answer import Document
 from rack.tools.recording.recording import Recording
 
 QUOTA_NS = 100_000_000
-"""Period of quotas: the default of Linux (cpu.max), and so of libvirt, Docker and Kubernetes."""
+"""Period of CPU quotas: the default of Linux (cpu.max), so of libvirt, Docker and Kubernetes."""
 LEAST_STALLS = 5
 CLUSTERED = 0.75
 WINDOW = 0.02
-"""So many stalls, of which this part ends within one window, a part of the period, are no chance.
+"""Thresholds of the quota test: number of stalls, their share in one window, and its width.
 
-With phases that have nothing to do with the period, four of five end within 2 % of it once in 6,300
-runs; more stalls make that rarer still. Three quarters, since a level that is late by itself ends
-at few phases: at two, if its cycle is half the period.
+The width is a fraction of the quota period. If phases have nothing to do with the period, four of
+five end within 2 % of it once in 6,300 runs; more stalls make that rarer still. Three quarters
+suffice, because a level that is late for its own reasons ends at few phases: at two, if its cycle
+is half the period.
 """
 
 
 @dataclass(frozen=True)
 class Absence:
-    """A core that was away without steal: how often, the longest time, and the cycles lost
-    meanwhile.
+    """Times at which a core was away without steal.
+
+    Attributes:
+        core: The core.
+        times: Number of absences.
+        longest_ms: Longest absence.
+        lost: Number of cycles lost during them.
     """
 
     core: int
@@ -49,10 +56,12 @@ class Absence:
 
 @dataclass(frozen=True)
 class Quota:
-    """Stalls that end at one phase of `QUOTA_NS`: `together` of `stalls`.
+    """Stalls that end at the same phase of `QUOTA_NS`, which points to a CPU quota.
 
-    They also end at one phase of the cycles of `levels`, multiples of that, which may then be the
-    cause.
+    Attributes:
+        together: Number of stalls that end at that phase.
+        stalls: Number of all stalls.
+        levels: Levels whose period is a multiple of `QUOTA_NS` and which may be the cause instead.
     """
 
     together: int
@@ -62,8 +71,13 @@ class Quota:
 
 @dataclass(frozen=True)
 class Stalls:
-    """What took the cycles of a run: `lost` counts all, late or skipped, `during_steal` those due
-    while it rose.
+    """Lost cycles of a run, and how many of them were due while a core was away.
+
+    Attributes:
+        lost: Number of all late or skipped cycles.
+        during_steal: Number of lost cycles that were due while the steal of their core rose.
+        absences: Absences without steal, by core.
+        quota: The suspected quota, or None.
     """
 
     lost: int
@@ -73,57 +87,60 @@ class Stalls:
 
 
 def stalls_of(recording: Recording) -> tuple[Stalls, dict[int, Occupation]]:
-    """Return what took the cycles of a run, and by core when it was away.
+    """Find the absences of cores in a run, and the cycles lost to them.
 
-    While the clock's core is away without steal, the whole machine may be: that counts for every
-    core.
+    While the clock's core is away without steal, the whole machine may be, so that time counts as
+    an absence of every core.
+
+    Returns:
+        The summary, and the times at which each core was away.
     """
     clock = recording.rack_config.clock
-    home = obtained_core(clock.core)
+    clock_core = obtained_core(clock.core)
     cycles = _Cycles(recording)
-    # In lockstep nothing is due at a time.
+    # In lockstep no cycle has a due time.
     is_shown = clock.mode == "realtime" and clock.priority > 0 and cycles.is_urgent.any()
     late_clock = cycles.late_clock(recording.events if is_shown else [])
     without_clock = Occupation(*late_clock)
     spans = np.array(recording.cores.stolen or (), np.int64).reshape(-1, 4)
-    away = {}
+    absent_spans = {}
     absences = []
     during_steal = 0
-    for core in dict.fromkeys([home, *cycles.core.tolist()]):
-        here = cycles.core == core
-        is_home = core == home
+    for core in dict.fromkeys([clock_core, *cycles.core.tolist()]):
+        on_core = cycles.core == core
+        is_home = core == clock_core
         stolen = Occupation(*spans[spans[:, 2] == core, :2].T)
-        since, until = late_clock if is_home else cycles.unstamped(here, is_shown)
-        # Without the clock no task is released: the other cores need not have been away.
-        known = stolen if is_home else Occupation.union([stolen, without_clock])
+        since, until = late_clock if is_home else cycles.unstamped(on_core, is_shown)
+        # Without the clock no task is released, which explains idle time on the other cores.
+        explained = stolen if is_home else Occupation.union([stolen, without_clock])
         is_away = until - since > cycles.grid_ns // LATE_PART
-        is_away &= known.within(since, until) == 0
+        is_away &= explained.within(since, until) == 0
         unstolen = Occupation(since[is_away], until[is_away])
-        if len(lasted := unstolen.ends - unstolen.starts):
-            lost = cycles.lost_during(unstolen, here | is_home)
-            absences.append(Absence(core, len(lasted), int(lasted.max()) / 1e6, lost))
-        during_steal += cycles.lost_during(stolen, here)
-        away[core] = Occupation.union([stolen, unstolen, without_clock])
+        if len(durations_ns := unstolen.ends - unstolen.starts):
+            lost = cycles.lost_during(unstolen, on_core | is_home)
+            absences.append(Absence(core, len(durations_ns), int(durations_ns.max()) / 1e6, lost))
+        during_steal += cycles.lost_during(stolen, on_core)
+        absent_spans[core] = Occupation.union([stolen, unstolen, without_clock])
     levels_ns = {
         task.name: task.every * cycles.grid_ns
         for task in recording.layout.tasks
         if task.role == "executor"
     }
     quota = _quota(cycles.ends(), levels_ns)
-    return Stalls(int(cycles.lost.sum()), during_steal, absences, quota), away
+    return Stalls(int(cycles.lost.sum()), during_steal, absences, quota), absent_spans
 
 
 class _Cycles:
-    """All cycles of a run, task by task.
+    """All cycles of a run, task by task. All arrays have shape (n,).
 
     Attributes:
-        rows: Trace records, shape (n,), as all that follow.
+        rows: Trace records.
         core: Core of the task.
-        is_urgent: Whether it has a real-time priority.
-        due_ns: Release of the first cycle that was skipped before this one, or of this one.
-        resumed_ns: Time at which what cost cycles was over.
-        lost: Cycles that this one and those skipped before it cost.
-        grid_ns: Time of a tick.
+        is_urgent: True if the task has a real-time priority.
+        due_ns: Release of this cycle, or of the first cycle skipped before it.
+        resumed_ns: Time at which the cause of the lost cycles was over.
+        lost: Number of cycles lost: this one if late, and those skipped before it.
+        grid_ns: Length of a tick in real time.
     """
 
     def __init__(self, recording: Recording) -> None:
@@ -135,67 +152,77 @@ class _Cycles:
         self.is_urgent = priority > 0
         self.grid_ns = recording.rack_config.tick_ns
         self.due_ns = rows["release_ns"] - skipped(rows) * every * self.grid_ns
-        # What cost releases was over as the next cycle began; what made a cycle late may have come
-        # in its midst.
+        # The cause of skipped releases was over when the next cycle began. The cause of a late
+        # cycle may have occurred during that cycle.
         self.resumed_ns = np.where(is_missed(rows), rows["end_ns"], rows["start_ns"])
         self.lost = skipped(rows) + is_missed(rows)
 
     def lost_during(self, occupied: Occupation, among: np.ndarray) -> int:
-        """Return how many cycles were lost while a core was occupied, `among` some of them."""
+        """Count the cycles among `among` that were lost while a core was occupied."""
         is_hit = occupied.within(self.due_ns, self.resumed_ns) > 0
         return int(self.lost[among & is_hit].sum())
 
     def ends(self) -> np.ndarray:
-        """Return when the spans ended in which cycles of executors were lost."""
-        # A plan may be due for longer than a stall lasts.
+        """Return the end times of the spans in which executors lost cycles."""
+        # Plans are left out: their time slice may be longer than a stall.
         counted = (self.lost > 0) & (self.rows["flags"] & Flag.PLANNED == 0)
         return Occupation(self.due_ns[counted], self.resumed_ns[counted]).ends
 
     def late_clock(self, events: list[Document]) -> tuple[np.ndarray, np.ndarray]:
-        """Return since when the clock's board was away, due at a grid point, and until when."""
+        """Return from when to when the clock board was away, for each late wake-up."""
         late = [
             (e["since"], e["value"])
             for e in events
             if e.get("code") == "clock_late" and e["board"] == CLOCK
         ]
         since, late_ns = np.array(late, np.int64).reshape(-1, 2).T
-        # All releases are on the clock's grid.
-        begun_ns = (self.rows["release_ns"] - self.rows["tick"] * self.grid_ns).max(initial=0)
-        due_ns = begun_ns + since * self.grid_ns
+        # All releases lie on the clock's grid, so any row yields the time of tick 0.
+        start_ns = (self.rows["release_ns"] - self.rows["tick"] * self.grid_ns).max(initial=0)
+        due_ns = start_ns + since * self.grid_ns
         return due_ns, due_ns + late_ns
 
-    def unstamped(self, here: np.ndarray, is_shown: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Return since when each cycle of a core was due and no task left a stamp there, until it
-        started.
+    def unstamped(self, on_core: np.ndarray, is_shown: bool) -> tuple[np.ndarray, np.ndarray]:
+        """Return the span before each cycle of a core in which no task ran although one was due.
+
+        Args:
+            on_core: Mask of the cycles on that core.
+            is_shown: False if no cycle has a known due time, as in lockstep. All spans are then
+                empty.
+
+        Returns:
+            Begin and end of each span, ns of CLOCK_MONOTONIC.
         """
-        rows = self.rows[here]
+        rows = self.rows[on_core]
         starts = rows["start_ns"]
-        due_ns = np.where(is_shown & self.is_urgent, self.due_ns, self.rows["start_ns"])[here]
+        due_ns = np.where(is_shown & self.is_urgent, self.due_ns, self.rows["start_ns"])[on_core]
         stamps = np.sort(np.concatenate([rows[name] for name in STAMPS]))
-        # Before its first stamp a core is not judged: place -1 is the last stamp of the run.
+        # Before its first stamp a core is not judged: index -1 is the last stamp of the run, so
+        # that the span is empty.
         return np.maximum(due_ns, stamps[np.searchsorted(stamps, starts) - 1]), starts
 
 
-def _quota(ends: np.ndarray, cycles_ns: dict[str, int]) -> Quota | None:
-    """Return at how many of the `ends` of stalls a quota ended, if that is no chance; `cycles_ns`
-    are by level.
+def _quota(ends: np.ndarray, periods_ns: dict[str, int]) -> Quota | None:
+    """Return the quota that stalls point to, or None if their phases look random.
 
-    Lost cycles that overlap, on any core, are one stall; it ends as the last of them runs again.
+    Args:
+        ends: Times at which stalls ended. Lost cycles that overlap, on any core, are one stall,
+            which ends when the last of them runs again.
+        periods_ns: Period of each level.
     """
-    if len(ends) < LEAST_STALLS or (together := _at_one_phase(ends, QUOTA_NS)) < CLUSTERED * len(
-        ends
-    ):
+    if len(ends) < LEAST_STALLS or (
+        at_one_phase := _at_one_phase(ends, QUOTA_NS)
+    ) < CLUSTERED * len(ends):
         return None
     levels = [
         name
-        for name, ns in cycles_ns.items()
-        if not ns % QUOTA_NS and _at_one_phase(ends, ns) >= together
+        for name, ns in periods_ns.items()
+        if not ns % QUOTA_NS and _at_one_phase(ends, ns) >= at_one_phase
     ]
-    return Quota(together, len(ends), levels)
+    return Quota(at_one_phase, len(ends), levels)
 
 
 def _at_one_phase(ends: np.ndarray, period_ns: int) -> int:
-    """Return the largest number of times within one window of a period."""
+    """Return the largest number of times that fall within one window of a period."""
     phases = np.sort(ends % period_ns)
     around = np.append(phases, phases + period_ns)
     following = np.searchsorted(around, phases + WINDOW * QUOTA_NS, side="right")

@@ -1,14 +1,14 @@
-"""Recordings of several racks on one time line: that of the first one.
+"""Places the recordings of several racks on one time line, which is the first rack's.
 
 In real time each machine has its own CLOCK_MONOTONIC, and each rack its own grid on it. Racks that
-work together over a network record the offset of the other's clock (`rack.levels.peer`): from rack
-to rack, these offsets lead to the first one's. In lockstep all racks have one simulated time, and
-there is nothing to convert.
+work together over a network record the offset of the other rack's clock (`rack.levels.peer`). These
+offsets lead from rack to rack to the first one. In lockstep all racks share one simulated time, and
+nothing has to be converted.
 
-Recordings of different launches share no time line. In real time the mailbox of a peer says where
-the peer's simulated time is, and the peer's recording says so too: launches have no tick 0 in
-common. In lockstep, where every launch begins at 0, what a rack took from another must be what that
-one wrote.
+Recordings of different launches share no time line, and are rejected. In real time, the mailbox of
+a peer and the peer's own recording must agree on the peer's simulated time, because tick 0 differs
+between launches. In lockstep, where every launch begins at 0, the messages that a rack imported
+must equal the messages of the sender.
 """
 
 from __future__ import annotations
@@ -28,11 +28,25 @@ from rack.tools.recording.recording import Recording
 
 Ints = NDArray[np.int64]
 TOLERANCE_NS = 1_000_000
-"""Difference between two accounts of one simulated time: rounding. Launches differ by seconds."""
+"""Largest difference between two records of the same simulated time.
+
+Rounding causes smaller differences; different launches differ by seconds.
+"""
 
 
 class RackGrid:
-    """The grid of a recorded rack: its simulated time on CLOCK_MONOTONIC of its machine."""
+    """The clock grid of a recorded rack: its simulated time on its machine's CLOCK_MONOTONIC.
+
+    Attributes:
+        recording: The recording.
+        rack: Name of the rack.
+        is_lockstep: True if it ran in lockstep.
+        clock_ns: Simulated time of a tick.
+        period_ns: Real time of a tick.
+        launch: Time of the launch.
+        epoch_ns: CLOCK_MONOTONIC of tick 0.
+        ticks: First and last recorded tick.
+    """
 
     def __init__(self, recording: Recording) -> None:
         config = recording.rack_config
@@ -57,20 +71,29 @@ class RackGrid:
         """The first and the last one recorded."""
 
     def stamp_ns(self, ticks: Ints, within_ns: Ints | int = 0) -> Ints:
-        """Return the CLOCK_MONOTONIC of ticks, and `within_ns` of simulated time later."""
+        """Convert ticks to CLOCK_MONOTONIC time stamps.
+
+        Args:
+            ticks: The ticks, shape (n,).
+            within_ns: Simulated time after each tick.
+        """
         within: Ints = np.asarray(within_ns) * self.period_ns // self.clock_ns
         return self.epoch_ns + ticks * self.period_ns + within
 
     def time_ns(self, stamps_ns: Ints) -> Ints:
-        """Return the simulated times at those of CLOCK_MONOTONIC."""
+        """Convert CLOCK_MONOTONIC time stamps to simulated time."""
         whole, rest = np.divmod(stamps_ns - self.epoch_ns, self.period_ns)
         return np.asarray(whole * self.clock_ns + rest * self.clock_ns // self.period_ns)
 
 
 @dataclass(frozen=True)
 class Shift:
-    """How far CLOCK_MONOTONIC of one machine is ahead of another's: `by_ns`, at `at_ns` of the
-    first; both (n,).
+    """Offset between the CLOCK_MONOTONIC of two machines.
+
+    Attributes:
+        at_ns: Time stamps of the first machine at which the offset was measured, shape (n,).
+        by_ns: Time by which the first machine is ahead of the second, shape (n,).
+        uncertainty_ns: Largest error of the offset.
     """
 
     at_ns: Ints
@@ -78,19 +101,19 @@ class Shift:
     uncertainty_ns: int
 
     def to_other(self, stamps_ns: Ints) -> Ints:
-        """Return stamps of the first machine as stamps of the other one."""
-        # Relative to the first, so that the 53 bits of a float suffice.
+        """Convert time stamps of the first machine to the clock of the second machine."""
+        # Interpolate relative to the first value, because floats have only 53 bits.
         first = self.by_ns[0]
         by_ns = np.interp(stamps_ns - self.at_ns[0], self.at_ns - self.at_ns[0], self.by_ns - first)
         return np.asarray(stamps_ns - first - np.rint(by_ns).astype(np.int64))
 
     def reversed(self) -> Shift:
-        """Return the shift of the other machine."""
+        """Return the offset with the two machines exchanged."""
         return Shift(self.at_ns - self.by_ns, -self.by_ns, self.uncertainty_ns)
 
 
 class Mark(NamedTuple):
-    """What a user should see on the time line, at a tick."""
+    """A note for the user at a tick of the time line."""
 
     tick: int
     text: str
@@ -98,9 +121,15 @@ class Mark(NamedTuple):
 
 @dataclass(frozen=True)
 class RackPlace:
-    """A recorded rack on the time line: by what shifts its clock leads to the first rack's; without
-    any it is there tick by tick, as the first one itself, racks in lockstep, and, `by_ticks`, two
-    runs of one rack. `marks`: what a user should know of it, unless it is the first one.
+    """The place of a recorded rack on the time line of another one.
+
+    Attributes:
+        own: Grid of the rack.
+        line: Grid of the rack that gives the time line.
+        offsets: Clock offsets that lead from the rack to the line's. Empty if both share their
+            ticks, as in lockstep, or for the first rack itself.
+        by_ticks: True if two runs of the same rack are aligned tick by tick.
+        marks: Notes for the user. Empty for the first rack.
     """
 
     own: RackGrid
@@ -111,12 +140,12 @@ class RackPlace:
 
     @property
     def uncertainty_ns(self) -> int:
-        """Largest error of its stamps on the line's machine."""
+        """Largest error of its time stamps after conversion to the line's machine."""
         return sum(shift.uncertainty_ns for shift in self.shifts)
 
     @property
     def note(self) -> str:
-        """What a user should know of it."""
+        """Sentence that says where the rack begins on the time line."""
         text = f"rack '{self.own.rack}' is on the time line of '{self.line.rack}'"
         if self.own.is_lockstep:
             return f"{text}: both ran in lockstep, tick by tick"
@@ -127,62 +156,72 @@ class RackPlace:
         )
 
     def stamps_ns(self, stamps_ns: Ints) -> Ints:
-        """Return stamps of its machine as stamps of the line's."""
+        """Convert time stamps of the rack's machine to the clock of the line's machine."""
         for shift in self.shifts:
             stamps_ns = shift.to_other(stamps_ns)
         return stamps_ns
 
     def times_ns(self, ticks: Ints, within_ns: Ints | int) -> Ints:
-        """Return simulated times on the line of its ticks, and `within_ns` of its own simulated
-        time later.
+        """Convert ticks of the rack to simulated time of the line.
+
+        Args:
+            ticks: The ticks, shape (n,).
+            within_ns: Simulated time of the rack after each tick.
         """
         if not self.shifts:
             return ticks * self.own.clock_ns + within_ns
         return self.line.time_ns(self.stamps_ns(self.own.stamp_ns(ticks, within_ns)))
 
     def wall_ns(self, stamps_ns: Ints) -> Ints:
-        """Return stamps of its machine on the line's wall clock; without shifts on its own."""
+        """Convert time stamps to the line's wall clock, or to its own if it has no offsets."""
         launch = self.line.launch if self.shifts else self.own.launch
         return self.stamps_ns(stamps_ns) + launch.wall_offset_ns
 
 
 def on_one_time_line(recordings: Sequence[Recording]) -> list[RackPlace]:
-    """Return where the racks of these recordings are on the time line of the first one.
+    """Place the racks of these recordings on the time line of the first one.
 
-    Raises `Failure` if they did not run together, or nothing leads from one to another.
+    Raises:
+        Failure: They did not run together, or no clock comparison connects them.
     """
     grids = [RackGrid(recording) for recording in recordings]
-    for at, grid in enumerate(grids):
-        _check_company(grid, grids[:at])
+    for index, grid in enumerate(grids):
+        _check_company(grid, grids[:index])
     placed = {0: RackPlace(grids[0], grids[0])}
     while len(placed) < len(grids):
-        near = [(a, b) for a in placed for b in range(len(grids)) if b not in placed]
-        ways = ((a, b, way) for a, b in near if (way := _way(grids[b], grids[a])) is not None)
-        if (found := next(ways, None)) is None:
-            lone = next(grid for at, grid in enumerate(grids) if at not in placed)
-            met = ", ".join(f"'{grids[at].rack}'" for at in placed)
+        connections = (
+            (near, far, offsets)
+            for near in placed
+            for far in range(len(grids))
+            if far not in placed and (offsets := _way(grids[far], grids[near])) is not None
+        )
+        if (connection := next(connections, None)) is None:
+            unplaced = next(grid for index, grid in enumerate(grids) if index not in placed)
+            placed_names = ", ".join(f"'{grids[index].rack}'" for index in placed)
             raise Failure(
-                f"{lone.recording.folder}: rack '{lone.rack}' and {met} never met: no recording"
-                " holds a comparison of their clocks; each rack needs one that has it among its"
-                " peers",
+                f"{unplaced.recording.folder}: rack '{unplaced.rack}' and {placed_names} never met:"
+                " no recording holds a comparison of their clocks; each rack must be a peer of"
+                " another one",
                 2,
             )
-        a, b, shifts = found
-        place = RackPlace(grids[b], grids[0], (*shifts, *placed[a].shifts))
-        placed[b] = replace(place, marks=(Mark(0, place.note),))
-    return [placed[at] for at in range(len(grids))]
+        near, far, shifts = connection
+        place = RackPlace(grids[far], grids[0], (*shifts, *placed[near].shifts))
+        placed[far] = replace(place, marks=(Mark(0, place.note),))
+    return [placed[index] for index in range(len(grids))]
 
 
 def side_by_side(recordings: Sequence[Recording]) -> list[RackPlace]:
-    """Return the places of two runs of one rack, tick by tick, each by the name of its folder; a
-    branch and the run that it branches off, say.
+    """Align two runs of the same rack tick by tick, for example a branch and its origin.
 
-    Raises `Failure` if they are not of one rack, or lack rows.
+    Each run gets the name of its folder.
+
+    Raises:
+        Failure: They are not two runs of the same rack, or one lacks rows.
     """
     folders = [recording.folder.resolve() for recording in recordings]
     if len(recordings) != 2 or folders[0] == folders[1]:
-        raise Failure("--against: permitted: two runs of one rack, a folder each", 2)
-    unlike = unlike_messages(*recordings)
+        raise Failure("--against needs two runs of the same rack, in different folders", 2)
+    differences = unlike_messages(*recordings)
     other = recordings[1]
     grids = [RackGrid(recording) for recording in recordings]
     names = [folder.name for folder in folders]
@@ -193,8 +232,8 @@ def side_by_side(recordings: Sequence[Recording]) -> list[RackPlace]:
     marks = []
     if (tick := continued_at(other)) is not None:
         marks.append(Mark(tick, f"{names[1]} branches off"))
-    if unlike:
-        first = unlike[0]
+    if differences:
+        first = differences[0]
         marks.append(Mark(first.tick, f"{names[1]} differs from {names[0]}: {first.mailbox}"))
     marks = marks or [Mark(0, f"all that {names[0]} and {names[1]} both wrote is equal")]
     line = grids[0]
@@ -205,6 +244,7 @@ def side_by_side(recordings: Sequence[Recording]) -> list[RackPlace]:
 
 
 def _check_company(grid: RackGrid, others: Sequence[RackGrid]) -> None:
+    """Raise `Failure` if a rack cannot share a time line with one of the others."""
     for other in others:
         if other.rack == grid.rack:
             where = f"{other.recording.folder} and {grid.recording.folder}"
@@ -221,55 +261,62 @@ def _check_company(grid: RackGrid, others: Sequence[RackGrid]) -> None:
             raise Failure(f"{where}: they have no time in common", 2)
 
 
-def _way(own: RackGrid, other: RackGrid) -> tuple[Shift, ...] | None:
-    """Return the shift that leads from a rack's clock to another's, if either has compared them; in
-    lockstep none.
+def _way(grid: RackGrid, other: RackGrid) -> tuple[Shift, ...] | None:
+    """Return the clock offset between two racks, or None if neither has met the other.
+
+    In lockstep no offset is needed, so the result is empty.
     """
-    if own.is_lockstep:
-        met = [_has_met(one, two) for one, two in ((own, other), (other, own))]
-        return () if any(met) else None
-    seen = _sighting(other, own), _sighting(own, other)
-    found = [shift for shift in (seen[0], seen[1] and seen[1].reversed()) if shift is not None]
-    return (min(found, key=lambda shift: shift.uncertainty_ns),) if found else None
+    if grid.is_lockstep:
+        have_met = [
+            _has_met(observer, observed) for observer, observed in ((grid, other), (other, grid))
+        ]
+        return () if any(have_met) else None
+    measured = _sighting(other, grid), _sighting(grid, other)
+    offsets = [
+        shift
+        for shift in (measured[0], measured[1] and measured[1].reversed())
+        if shift is not None
+    ]
+    return (min(offsets, key=lambda shift: shift.uncertainty_ns),) if offsets else None
 
 
-def _mailbox(of: RackGrid, peer: RackGrid) -> str | None:
-    """Return the mailbox in which a rack keeps what it knows of another, if there is one."""
-    boxes = of.recording.layout.mailboxes
+def _mailbox(observer: RackGrid, peer: RackGrid) -> str | None:
+    """Return the mailbox in which a rack recorded the presence of a peer, or None."""
+    boxes = observer.recording.layout.mailboxes
     names = (
         box.name
         for box in boxes
         if box.message == PeerPresence.message_type.name
         and box.name.endswith(f".{peer_port(peer.rack)}")
     )
-    return next((name for name in names if name in of.recording.mailboxes), None)
+    return next((name for name in names if name in observer.recording.mailboxes), None)
 
 
-def _sighting(of: RackGrid, peer: RackGrid) -> Shift | None:
-    """Return how far a peer's clock is ahead, as a rack has recorded it; None if it never measured
-    that.
+def _sighting(observer: RackGrid, peer: RackGrid) -> Shift | None:
+    """Return the offset of a peer's clock as recorded by a rack, or None if it never measured it.
 
-    Raises `Failure` if it has met other launches of the peer only.
+    Raises:
+        Failure: The rack has met only other launches of the peer.
     """
-    if (mailbox := _mailbox(of, peer)) is None:
+    if (mailbox := _mailbox(observer, peer)) is None:
         return None
-    read = of.recording.signal
+    read = observer.recording.signal
     uncertainty = read(mailbox, "uncertainty")
-    known = uncertainty >= 0.0
-    if not known.any():
+    is_measured = uncertainty >= 0.0
+    if not is_measured.any():
         return None
-    ticks = read(mailbox, "tick")[known]
-    by_ns = np.rint(read(mailbox, "offset")[known] * 1e9).astype(np.int64)
-    at_ns = of.stamp_ns(ticks) + by_ns
-    seen_ns = np.rint(ticks * of.clock_ns + read(mailbox, "ahead")[known] * 1e9)
-    apart_ns = peer.time_ns(at_ns) - seen_ns
-    # Of a peer that had not begun yet, nothing says which launch it was.
-    is_this = (np.abs(apart_ns) <= TOLERANCE_NS) & (seen_ns > 0)
+    ticks = read(mailbox, "tick")[is_measured]
+    by_ns = np.rint(read(mailbox, "offset")[is_measured] * 1e9).astype(np.int64)
+    at_ns = observer.stamp_ns(ticks) + by_ns
+    seen_ns = np.rint(ticks * observer.clock_ns + read(mailbox, "ahead")[is_measured] * 1e9)
+    disagreement_ns = peer.time_ns(at_ns) - seen_ns
+    # A peer that had not started yet cannot be matched to a launch.
+    is_this = (np.abs(disagreement_ns) <= TOLERANCE_NS) & (seen_ns > 0)
     if not is_this.any():
-        began_s = float(apart_ns[-1]) * 1e-9 * peer.period_ns / peer.clock_ns
+        began_s = float(disagreement_ns[-1]) * 1e-9 * peer.period_ns / peer.clock_ns
         raise Failure(
-            f"{of.recording.folder} and {peer.recording.folder} are not of the same run: the rack"
-            f" '{peer.rack}' that '{of.rack}' met began {abs(began_s):.3f} s"
+            f"{observer.recording.folder} and {peer.recording.folder} are not of the same run:"
+            f" '{observer.rack}' met a launch of '{peer.rack}' that began {abs(began_s):.3f} s"
             f" {'later' if began_s > 0 else 'earlier'}",
             2,
         )
@@ -278,43 +325,53 @@ def _sighting(of: RackGrid, peer: RackGrid) -> Shift | None:
     order = np.argsort(at_ns, kind="stable")
     at_ns = at_ns[order]
     by_ns = by_ns[order]
-    # Between two comparisons, and before the first and after the last, the clocks may drift.
+    # The clocks may drift between two comparisons, before the first and after the last.
     ends = peer.stamp_ns(np.array(peer.ticks))
-    alone_ns = int(np.diff(np.sort(np.concatenate((at_ns, ends)))).max())
-    worst_ns = round(float(uncertainty[known][is_this].max()) * 1e9)
-    return Shift(at_ns, by_ns, worst_ns + alone_ns * DRIFT_PPM // 1_000_000)
+    longest_gap_ns = int(np.diff(np.sort(np.concatenate((at_ns, ends)))).max())
+    worst_ns = round(float(uncertainty[is_measured][is_this].max()) * 1e9)
+    return Shift(at_ns, by_ns, worst_ns + longest_gap_ns * DRIFT_PPM // 1_000_000)
 
 
-def _has_met(of: RackGrid, peer: RackGrid) -> bool:
-    """Return whether a rack in lockstep worked with another. Raises `Failure` if that was not in
-    this run.
+def _has_met(observer: RackGrid, peer: RackGrid) -> bool:
+    """Return True if a rack in lockstep worked with another one.
+
+    Raises:
+        Failure: It worked with a different launch of that rack.
     """
-    mailbox = _mailbox(of, peer)
-    if mailbox is None or not (of.recording.signal(mailbox, "presence") == Presence.THERE).any():
+    mailbox = _mailbox(observer, peer)
+    if (
+        mailbox is None
+        or not (observer.recording.signal(mailbox, "presence") == Presence.THERE).any()
+    ):
         return False
-    lan = of.recording.rack_config.adapter.lan
+    lan = observer.recording.rack_config.adapter.lan
     for port, entry in () if lan is None else lan.imports.items():
         if entry.rack == peer.rack:
-            _check_import(of, f"{mailbox.partition('.')[0]}.{port}", peer, entry.mailbox)
+            _check_import(observer, f"{mailbox.partition('.')[0]}.{port}", peer, entry.mailbox)
     return True
 
 
-def _check_import(of: RackGrid, taken: str, peer: RackGrid, written: str) -> None:
-    """Check that what a rack took from another is what that one wrote."""
-    if taken not in of.recording.mailboxes or written not in peer.recording.mailboxes:
+def _check_import(
+    importer: RackGrid, import_mailbox: str, peer: RackGrid, source_mailbox: str
+) -> None:
+    """Raise `Failure` if messages that a rack imported are not the messages that the peer wrote."""
+    if (
+        import_mailbox not in importer.recording.mailboxes
+        or source_mailbox not in peer.recording.mailboxes
+    ):
         return
-    took = of.recording.rows(taken)
-    wrote = peer.recording.rows(written)
-    at_ns = wrote["tick"] * peer.clock_ns
-    content = [row.tobytes() for row in wrote["message"]]
-    for row in took:
-        # Its tick there is only known in ticks here, which may be longer.
-        since_ns = int(row["basis"]) * of.clock_ns
-        first, end = np.searchsorted(at_ns, (since_ns, since_ns + of.clock_ns))
+    imported = importer.recording.rows(import_mailbox)
+    sent = peer.recording.rows(source_mailbox)
+    at_ns = sent["tick"] * peer.clock_ns
+    content = [row.tobytes() for row in sent["message"]]
+    for row in imported:
+        # The sender's tick is only known in ticks of the importer, which may be longer.
+        since_ns = int(row["basis"]) * importer.clock_ns
+        first, end = np.searchsorted(at_ns, (since_ns, since_ns + importer.clock_ns))
         if first < end and row["message"].tobytes() not in content[first:end]:
             raise Failure(
-                f"{of.recording.folder} and {peer.recording.folder} are not of the same run: what"
-                f" '{of.rack}' took from '{peer.rack}' at {since_ns * 1e-9:.4f} s, in {taken}, is"
-                f" not what that one wrote to {written}",
+                f"{importer.recording.folder} and {peer.recording.folder} are not of the same run:"
+                f" the message that '{importer.rack}' imported into {import_mailbox} at"
+                f" {since_ns * 1e-9:.4f} s is not one that '{peer.rack}' wrote to {source_mailbox}",
                 2,
             )

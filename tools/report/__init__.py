@@ -1,1 +1,1 @@
-"""A run judged: its report, and its comparison with the timing model."""
+"""Report on a run, and its comparison with the timing model."""

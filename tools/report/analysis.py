@@ -1,6 +1,4 @@
-"""A run compared with the timing model: every equation twice, predicted from the budgets and as
-measured.
-"""
+"""Compares a run with the timing model, by predicting and measuring every equation."""
 
 from __future__ import annotations
 
@@ -26,13 +24,18 @@ from rack.tools.timing.measured_response import system_response
 MOSTLY = 99.0
 """Percentile for the question whether a level fails in most of its cycles."""
 OBSERVED = ("3.2", "3.3", "3.7", RESPONSE_TIME, LOAD)
-"""Equations that a run shows directly; the others follow from the times of its levels."""
+"""Equations that a run shows directly. The others follow from the times of its levels."""
 
 
 @dataclass(frozen=True)
 class Pair:
-    """One equation put to one subject. `predicted` is None without a budget, `measured` if a run
-    cannot show it.
+    """Predicted and measured verdict on one equation and one subject.
+
+    Attributes:
+        equation: Number or name of the equation.
+        subject: Level, task, core or chain of levels.
+        predicted: Verdict on the budgets, or None without a budget.
+        measured: Verdict on the run, or None if a run cannot show it.
     """
 
     equation: str
@@ -42,7 +45,7 @@ class Pair:
 
     @property
     def disagrees(self) -> bool:
-        """Whether the run contradicts the prediction."""
+        """True if the run contradicts the prediction."""
         if self.predicted is None or self.measured is None:
             return False
         # The measured load of an overloaded core stays below 1.
@@ -51,18 +54,26 @@ class Pair:
 
     @property
     def fails(self) -> bool:
-        """Whether the equation failed in the run."""
+        """True if the equation failed in the run."""
         return self.measured is not None and not self.measured.holds
 
 
 @dataclass(frozen=True)
 class Analysis:
-    """A run compared with the timing model.
+    """Comparison of a run with the timing model.
 
-    `predicted` is the rack with the budgets of its config, `measured` the rack with those of the
-    run. `cycles` are by task, `loads` by core, as parts of its time. `pairs` are of the
-    `percentile`, `mostly` of the longest of `MOSTLY` in 100 cycles: a level that does not fit fails
-    in most of its cycles, a machine that stalls now and then does not.
+    The equations are judged at two percentiles, because a level that does not fit fails in most of
+    its cycles, while a machine that stalls now and then makes it fail in a few.
+
+    Attributes:
+        recording: The run.
+        percentile: Percentage of the cycles that must fit.
+        cycles: Measured cycles, by task.
+        loads: Used part of each core's time.
+        predicted: Timing of the rack with the budgets of its config.
+        measured: Timing of the rack with the measured budgets.
+        pairs: Verdicts at `percentile`.
+        mostly: Verdicts at `MOST_CYCLES_PERCENTILE`, or at `percentile` if that is lower.
     """
 
     recording: Recording
@@ -81,8 +92,15 @@ class Analysis:
         percentile: float = WORST,
         progress: Callable[[float], None] = lambda part: None,
     ) -> Analysis:
-        """Analyze a recorded run; `progress` takes the part done. Raises `Failure` for an empty or
-        old trace.
+        """Analyze a recorded run.
+
+        Args:
+            recording: The run.
+            percentile: Percentage of the cycles that must fit.
+            progress: Called with the completed fraction.
+
+        Raises:
+            Failure: The recording has no cycles.
         """
         config = recording.rack_config
         layout = recording.layout
@@ -101,28 +119,29 @@ class Analysis:
         ]
         response = system_response(recording)
 
-        def judged(percent: float) -> tuple[RackTiming, tuple[Pair, ...]]:
+        def judge_equations(percent: float) -> tuple[RackTiming, tuple[Pair, ...]]:
+            """Return the measured timing at a percentile, and the verdicts on all equations."""
             budgets = without_interrupts(predicted, budgets_of(cycles, percent))
             rack = rack_timing(config, layout, budgets)
-            directly = [*_system(response, rack), *_tasks(cycles, rack, percent), *used]
+            observed = [*_system(response, rack), *_tasks(cycles, rack, percent), *used]
             derived = [verdict for verdict in verdicts(rack) if verdict.equation not in OBSERVED]
-            return rack, tuple(_paired(verdicts(predicted), [*derived, *directly]))
+            return rack, tuple(_paired(verdicts(predicted), [*derived, *observed]))
 
-        measured, pairs = judged(percentile)
+        measured, pairs = judge_equations(percentile)
         progress(0.7)
-        _, mostly = judged(min(percentile, MOSTLY))
+        _, mostly = judge_equations(min(percentile, MOSTLY))
         return cls(recording, percentile, cycles, loads, predicted, measured, pairs, mostly)
 
     @property
     def holds(self) -> bool:
-        """Whether every equation held in the run."""
+        """True if every equation held in the run."""
         return not any(pair.fails for pair in self.pairs)
 
 
 def _paired(
     predicted: Sequence[EquationVerdict], measured: Sequence[EquationVerdict]
 ) -> list[Pair]:
-    """Return every equation on every subject, in the order of the equations."""
+    """Pair the verdicts on each equation and subject, in the order of the equations."""
     sides = [{_key(verdict): verdict for verdict in side} for side in (predicted, measured)]
     pairs = [
         Pair(*key[:2], *(side.get(key) for side in sides))
@@ -132,52 +151,54 @@ def _paired(
 
 
 def _key(verdict: EquationVerdict) -> tuple[str, str, str]:
-    # The system's response is judged down and up; eq. 3.7 asks something else of a config than of a
-    # run.
+    """Return the key by which predicted and measured verdicts are paired."""
+    # The response is judged in two directions, and eq. 3.7 differs between a config and a run, so
+    # the meaning must match as well.
     meaning = verdict.meaning if verdict.equation in ("3.2", "3.3", "3.7") else ""
     return verdict.equation, verdict.subject, meaning
 
 
 def _system(response: Mapping[str, Any] | None, rack: RackTiming) -> Iterator[EquationVerdict]:
-    """Yield eq. 3.2 on the longest response of the run, and eq. 3.3 on the sum with its waits for
-    the grid.
+    """Yield eqs. 3.2 and 3.3 for the longest response of the run, in both directions.
+
+    The bound of eq. 3.3 is the sum of the cycles and of the waits for the grid.
     """
     if response is None:
         return
     # The response is in simulated time.
     wall_ns = 1e6 * rack.tick_ns / rack.clock_ns
-    for found, way in product((response, *response["others"]), ("command", "status")):
-        if (times := found[way]["measured_ms"]) is None:
+    for chain, direction in product((response, *response["others"]), ("command", "status")):
+        if (times := chain[direction]["measured_ms"]) is None:
             continue
-        bound = found["bound_eq_3_2_ms"] * wall_ns
+        bound = chain["bound_eq_3_2_ms"] * wall_ns
         limit = "n R_max"
         if rack.response_goal_ns is not None:
             bound = rack.response_goal_ns / rack.speed
             limit = "timing.response_ms"
         longest_ns = times["max"] * wall_ns
-        bound_ns = found[way]["bound_ms"] * wall_ns
-        meaning = f"R_s of a {way} with its waits for the grid <= {limit}"
-        yield EquationVerdict("3.2", found["subject"], longest_ns, "<=", bound, meaning)
-        meaning = f"R_s of a {way} <= sum of R_i and of the waits for the grid"
-        yield EquationVerdict("3.3", found["subject"], longest_ns, "<=", bound_ns, meaning)
+        bound_ns = chain[direction]["bound_ms"] * wall_ns
+        meaning = f"R_s of a {direction} with its waits for the grid <= {limit}"
+        yield EquationVerdict("3.2", chain["subject"], longest_ns, "<=", bound, meaning)
+        meaning = f"R_s of a {direction} <= sum of R_i and of the waits for the grid"
+        yield EquationVerdict("3.3", chain["subject"], longest_ns, "<=", bound_ns, meaning)
 
 
 def _tasks(
-    found: Mapping[str, Cycles], rack: RackTiming, percentile: float
+    cycles_by_task: Mapping[str, Cycles], rack: RackTiming, percentile: float
 ) -> Iterator[EquationVerdict]:
-    for name, cycles in found.items():
+    """Yield eq. 3.7 for executors, and in real time the response time of every task."""
+    for name, cycles in cycles_by_task.items():
         rows = cycles.rows
         if cycles.task.role == "executor":
             every_ns = cycle_ns(rack, cycles.task)
-            # By the releases skipped as traced: a restart, or a row lost by the recorder, is not a
-            # skipped release.
+            # Use the traced number of skipped releases, because a restart or a row lost by the
+            # recorder is not a skipped release.
             steps_ns = (1 + trace_times.skipped(rows)) * every_ns
             step_ns = worst_of(steps_ns[cycles.is_judged], percentile)
             yield EquationVerdict("3.7", name, step_ns, "=", every_ns, "t_(k+1) - t_k = R_i")
         if not rack.is_lockstep:
             deadline_ns = slice_ns(rack, cycles.task)
-            # A cycle whose message came too late, as its trace says, has missed its deadline
-            # whenever it ended.
+            # A cycle that the trace marks as missed has missed its deadline, whenever it ended.
             least_ns = np.where(trace_times.is_missed(rows), deadline_ns + 1, 0)
             response_ns = np.maximum(trace_times.response_ns(rows), least_ns)
             worst_ns = worst_of(response_ns[cycles.is_judged], percentile)
@@ -186,18 +207,26 @@ def _tasks(
 
 
 def core_loads(
-    recording: Recording, found: Mapping[str, Cycles], rack: RackTiming
+    recording: Recording, cycles_by_task: Mapping[str, Cycles], rack: RackTiming
 ) -> dict[int, float]:
-    """Return by core the part of its time that tasks used, without the clock's own.
+    """Return the part of each core's time that its tasks used, without the clock board.
 
-    An executor counts at all its releases, skipped ones too: so the load of an overloaded core
-    exceeds 1.
+    An executor counts at all of its releases, including skipped ones, so the load of an overloaded
+    core exceeds 1.
+
+    Args:
+        recording: The run.
+        cycles_by_task: Its measured cycles.
+        rack: Timing of the rack.
+
+    Returns:
+        Loads by core. 1 is a fully used core.
     """
     first = min(int(rows["tick"][0]) for rows in recording.cycles.values())
     last = max(int(rows["tick"][-1]) for rows in recording.cycles.values())
     lasted_ns = (last - first + 1) * rack.tick_ns
     loads: defaultdict[int, float] = defaultdict(float)
-    for name, cycles in found.items():
+    for name, cycles in cycles_by_task.items():
         used_ns = recording.cycles[name]["processor_ns"]
         if cycles.task.role == "executor":
             loads[cycles.core] += float(used_ns.mean()) / cycle_ns(rack, cycles.task)
@@ -207,10 +236,10 @@ def core_loads(
 
 
 def cycle_ns(rack: RackTiming, task: TaskSpec) -> int:
-    """Return R_i of a task's level."""
+    """Return R_i of a task's level, the time between two of its cycles."""
     return rack.boards[task.board].every * rack.tick_ns
 
 
 def slice_ns(rack: RackTiming, task: TaskSpec) -> int:
-    """Return the time available to one cycle of a task; d R_i, the time slice, of a planner."""
+    """Return the time available to a cycle of a task. For a planner it is the time slice, d R_i."""
     return task.slice * rack.tick_ns

@@ -1,6 +1,4 @@
-"""What the task, its objects and the arm or hand did, from a recording: as a report's data, and as
-its text.
-"""
+"""Outcome of the task, its objects, and the arm or hand, as data of a report and as its text."""
 
 from __future__ import annotations
 
@@ -20,26 +18,32 @@ DRIVING = ("servo_status", "arm_status")
 HAND_STATUS = "hand_status"
 WRENCH = "wrench"
 FORCE_STATUS = "force_status"
-"""Messages by name, as recordings hold them: to report on them takes no level that only other racks
-have."""
+"""Message types by name, as recordings contain them.
+
+A report must not import levels that only other racks have.
+"""
 FALLING_M_S = 0.05
-"""Speed from which an object falls: a grip that slips, or fingers that lower it, are slower."""
+"""Speed above which an object is falling. Slipping grips and lowering fingers are slower."""
 BOUNCE = 2
-"""Samples between the parts of one fall."""
+"""Number of samples that may separate two parts of the same fall."""
 SETTLE = 20
-"""Samples after a fall in which the object comes to rest: at first it sinks into what it landed on,
-or bounces."""
+"""Number of samples after a fall until the object rests.
+
+At first it sinks into the surface on which it landed, or bounces.
+"""
 LEAST_M = 0.005
-"""Least fall reported: tasks let go up to 2 mm above the support, and pads that open take a part
-along."""
+"""Smallest fall that is reported.
+
+Tasks let go up to 2 mm above the support, and opening pads can take an object along.
+"""
 
 
 Signals = Callable[[str], np.ndarray]
-"""Returns a field of all messages of a mailbox, by its name."""
+"""Function that returns a field of all messages of a mailbox, by the field's name."""
 
 
 def task_outcome(recording: Recording) -> Document | None:
-    """Return the last status of the level that reports on the whole task."""
+    """Return the last status of the level that reports on the whole task, or None."""
     status = signals_of(recording, TaskStatus.message_type.name)
     if status is None:
         return None
@@ -52,26 +56,27 @@ def task_outcome(recording: Recording) -> Document | None:
 
 
 def objects(recording: Recording, config: RackConfig) -> Iterator[Document]:
-    """Yield where each object that has a goal ended, and its falls."""
+    """Yield, for each object with a goal, its final position and its falls."""
     for end in recording.ended.get("outcome", {}).get("objects", ()):
         row = config.scene.objects.index(end["object"])
         yield {**end, "drops": list(_drops(recording, row))}
 
 
 def _drops(recording: Recording, row: int) -> Iterator[Document]:
-    """Yield tick and height, mm, of each fall of an object: it goes down quickly, and not with the
-    tool.
+    """Yield the falls of an object: tick and height, mm.
+
+    An object falls while it moves down quickly and its distance from the tool changes.
     """
     scene = signals_of(recording, Scene.message_type.name)
     if scene is None:
         return
     ticks = scene("tick")
-    place = scene("position")[:, row]
-    # What moves and turns with the tool keeps its distance from it.
-    away = np.linalg.norm(place - scene("tool_position"), axis=1)
-    height = place[:, 2]
-    least = FALLING_M_S * recording.layout.clock_ns * 1e-9 * np.diff(ticks)
-    falling = np.flatnonzero(np.minimum(-np.diff(height), np.abs(np.diff(away))) > least)
+    position = scene("position")[:, row]
+    # An object that moves and turns with the tool keeps its distance from the tool.
+    distance = np.linalg.norm(position - scene("tool_position"), axis=1)
+    height = position[:, 2]
+    threshold_m = FALLING_M_S * recording.layout.clock_ns * 1e-9 * np.diff(ticks)
+    falling = np.flatnonzero(np.minimum(-np.diff(height), np.abs(np.diff(distance))) > threshold_m)
     first = falling[np.diff(falling, prepend=-BOUNCE - 1) > BOUNCE]
     last = falling[np.diff(falling, append=len(ticks) + BOUNCE) > BOUNCE] + 1
     for begin, end in zip(first, last, strict=True):
@@ -80,8 +85,10 @@ def _drops(recording: Recording, row: int) -> Iterator[Document]:
 
 
 def motion(recording: Recording) -> Document | None:
-    """Return tracking error, mrad, where a status tells it, and the counts of touches, exceeded
-    limits and refused or cut commands, or None.
+    """Return the tracking error, mrad, and the counts of an arm, or None without an arm.
+
+    The error is None if no status contains it. The counts are touches, exceeded limits, and refused
+    or cut commands.
     """
     status = signals_of(recording, *DRIVING)
     counts = _counts(recording, status)
@@ -95,11 +102,13 @@ def motion(recording: Recording) -> Document | None:
 
 
 def _counts(recording: Recording, status: Signals | None) -> Document:
-    """Return what an arm or a hand has counted, by its state, and what the board that drives it has
-    cut besides, by its status; nothing without either.
+    """Return the final counts of an arm or hand, or {} without one.
+
+    They come from the arm's state and from the status of the board that drives it, which counts
+    commands that it cut itself. The larger count is returned.
     """
     state = signals_of(recording, ArmState.message_type.name)
-    if not (known := [found for found in (status, state) if found is not None]):
+    if not (sources := [source for source in (status, state) if source is not None]):
         return {}
     fields = {
         "touches": "touches",
@@ -107,55 +116,58 @@ def _counts(recording: Recording, status: Signals | None) -> Document:
         "pushed": "pushed",
         "clipped_cycles": "clipped",
     }
-    return {key: max(int(found(name)[-1]) for found in known) for key, name in fields.items()}
+    return {key: max(int(source(name)[-1]) for source in sources) for key, name in fields.items()}
 
 
 def _rms_and_peak(error: np.ndarray) -> tuple[float, float]:
+    """Return the root mean square and the largest magnitude of an error."""
     return rounded(np.sqrt(np.mean(error**2))), rounded(np.abs(error).max())
 
 
 def rounded(value: float) -> float:
-    """Return a number as reports show it."""
+    """Round a number to the precision of reports."""
     return round(float(value), 6)
 
 
 def hand(recording: Recording, config: RackConfig) -> Document | None:
-    """Return a hand's tensions as far as commanded, N, its forces by finger, N, and its counts, or
-    None.
+    """Return the results of a hand, or None without one.
+
+    They are tensions and their errors, N, the largest force of each finger, N, and counts.
     """
     status = signals_of(recording, HAND_STATUS)
     if status is None or config.robot is None or config.robot.hand is None:
         return None
     tension = status("tension")
     rms_n, peak_n = _rms_and_peak(tension - status("wanted"))
-    most = np.linalg.norm(status("force"), axis=2).max(axis=0)
+    largest_forces = np.linalg.norm(status("force"), axis=2).max(axis=0)
     fingers = [finger.name for finger in config.robot.hand.finger]
     return {
         "tension_rms_n": rms_n,
         "tension_peak_n": peak_n,
         "least_tension_n": rounded(tension.min()),
         "largest_tension_n": rounded(tension.max()),
-        "largest_force_n": dict(zip(fingers, map(rounded, most), strict=True)),
+        "largest_force_n": dict(zip(fingers, map(rounded, largest_forces), strict=True)),
         "closed_cycles": int(np.count_nonzero(status("stopped"))),
         **_counts(recording, status),
     }
 
 
 def force(recording: Recording) -> Document | None:
-    """Return what an arm's wrist has felt, N and N m, and how far forces were from those wanted, N,
-    or None.
+    """Return the largest force, N, and torque, N m, at the wrist, and the force error, N.
+
+    None without a wrist sensor.
     """
     wrench = signals_of(recording, WRENCH)
     status = signals_of(recording, FORCE_STATUS)
     if wrench is None:
         return None
-    halves = wrench("wrench").reshape(-1, 2, 3)
-    most_n, most_nm = np.linalg.norm(halves, axis=2).max(axis=0)
+    force_and_torque = wrench("wrench").reshape(-1, 2, 3)
+    most_n, most_nm = np.linalg.norm(force_and_torque, axis=2).max(axis=0)
     error = np.zeros(0)
     if status is not None:
-        # The tool exerts the opposite of what it feels.
-        off = status("wanted") + status("wrench")
-        error = off[:, :3][status("selected")[:, :3] == 1]
+        # The tool exerts the opposite of the wrench that it feels.
+        surplus = status("wanted") + status("wrench")
+        error = surplus[:, :3][status("selected")[:, :3] == 1]
     return {
         "largest_force_n": rounded(most_n),
         "largest_torque_nm": rounded(most_nm),
@@ -165,15 +177,16 @@ def force(recording: Recording) -> Document | None:
 
 
 def signals_of(recording: Recording, *messages: str) -> Signals | None:
-    """Return the signals of the first mailbox with messages of one of these types; None when it is
-    empty, or there is none.
+    """Return the signals of the first mailbox that carries one of these message types.
+
+    None if there is no such mailbox, or if it is empty.
     """
     name = next((m.name for m in recording.layout.mailboxes if m.message in messages), None)
     return partial(recording.signal, name) if name in recording.mailboxes else None
 
 
 def outcome_text(report: RunReport) -> Iterator[str]:
-    """Yield how far the task came, where its objects ended, and what the arm or hand did."""
+    """Yield sentences about the task, the objects, and the arm or hand."""
     if (task := report.task) is not None:
         done = (
             f"{task['action']} of {task['actions']} actions, {task['moves_done']} of"
@@ -182,13 +195,10 @@ def outcome_text(report: RunReport) -> Iterator[str]:
         yield ""
         yield f"Task {task['state']}: {done}{'; ' + task['reason'] if task['reason'] else ''}."
     for end in report.objects:
-        off = f"{end['off_mm']:.1f} mm from its goal (tolerance {end['tolerance_mm']:g} mm)"
-        yield f"Object {end['object']} ended {off}."
+        distance = f"{end['off_mm']:.1f} mm from its goal (tolerance {end['tolerance_mm']:g} mm)"
+        yield f"Object {end['object']} ended {distance}."
         for drop in end.get("drops", ()):
-            yield (
-                f"Object {end['object']} was let go {drop['mm']:.0f} mm above what it landed on, "
-                f"at tick {drop['tick']}."
-            )
+            yield f"Object {end['object']} fell {drop['mm']:.0f} mm at tick {drop['tick']}."
     if report.motion is not None:
         yield _motion_text(report.motion)
     if report.hand is not None:
@@ -198,6 +208,7 @@ def outcome_text(report: RunReport) -> Iterator[str]:
 
 
 def _motion_text(motion: Document) -> str:
+    """Return a sentence about the tracking error and the counts of an arm."""
     tracking = ""
     if motion["tracking_rms_mrad"] is not None:
         tracking = (
@@ -208,18 +219,20 @@ def _motion_text(motion: Document) -> str:
 
 
 def _counts_text(report: Document) -> str:
+    """Return a sentence about the counts of an arm or hand."""
     return (
         f"{report['touches']} touches; commands refused or cut in {report['clipped_cycles']}"
-        f" cycles; limits exceeded in {report['violations']} substeps, by a push from outside in"
-        f" {report['pushed']}."
+        f" cycles; limits exceeded in {report['violations']} substeps, of which an external push"
+        f" caused {report['pushed']}."
     )
 
 
 def _hand_text(hand: Document) -> Iterator[str]:
+    """Yield sentences about the tensions and forces of a hand."""
     yield (
-        f"Tensions {hand['tension_rms_n']:.2f} N RMS off their commands,"
-        f" {hand['tension_peak_n']:.2f} peak; {hand['least_tension_n']:.2f} to"
-        f" {hand['largest_tension_n']:.2f} N; valves closed in {hand['closed_cycles']} cycles;"
+        f"Tension error {hand['tension_rms_n']:.2f} N RMS, {hand['tension_peak_n']:.2f} peak;"
+        f" tensions from {hand['least_tension_n']:.2f} to {hand['largest_tension_n']:.2f} N;"
+        f" valves closed in {hand['closed_cycles']} cycles;"
         f" {_counts_text(hand)}"
     )
     forces = ", ".join(f"{finger} {force:.2f}" for finger, force in hand["largest_force_n"].items())
@@ -227,9 +240,10 @@ def _hand_text(hand: Document) -> Iterator[str]:
 
 
 def _force_text(force: Document) -> str:
+    """Return a sentence about the contact forces of an arm."""
     rms_n = force["force_rms_n"]
-    off = "" if rms_n is None else f"; axes of force {rms_n:.2f} N RMS off"
+    error = "" if rms_n is None else f"; force error {rms_n:.2f} N RMS"
     return (
         f"Contact: at most {force['largest_force_n']:.1f} N and {force['largest_torque_nm']:.2f} N"
-        f" m, beyond the arm's limits in {force['exceeded_cycles']} cycles{off}."
+        f" m, above the arm's limits in {force['exceeded_cycles']} cycles{error}."
     )

@@ -1,10 +1,9 @@
-"""A cycle of two recorded runs, repeated in both: was the level's state equal before it, and does
-its code do again what it did?
+"""Repeats a cycle of two recorded runs, to find out why its message differed.
 
-The inputs of that cycle were equal in both, see `rack.tools.recording.causes`. A run that does not
-repeat its own message now has a level whose code has changed since or, if it does not even repeat
-itself, one that depends on something besides messages, ticks and parameters. If both repeat theirs,
-what differs is the state of the level or its parameters.
+The inputs of the cycle were equal in both runs, see `rack.tools.recording.causes`. If a run does
+not repeat its own message, the level's code has changed since. If it does not even repeat itself,
+the level depends on something besides messages, ticks and parameters. If both runs repeat their
+messages, the state or the parameters of the level differed.
 """
 
 from __future__ import annotations
@@ -22,18 +21,21 @@ from rack.tools.recording.causes import Divergence, InBoth, UnlikeCycle, unlike_
 from rack.tools.recording.recording import Recording
 
 TIMES = 2
-"""How often a cycle is repeated."""
+"""Number of times that a cycle is repeated."""
 Because = Literal["state", "code", "chance"]
 
 
 @dataclass(frozen=True)
 class Repetition:
-    """What the repetition of a cycle in two runs has shown.
+    """Result of repeating a cycle in two runs.
 
-    `attributes` of the level differed before it. `because`: "state", or parameters, if each run
-    repeats its own message; "code" if that of the level has changed since one of them; "chance" if
-    it does not repeat itself. `runs` are those that do not repeat theirs. `strays`: mailboxes of
-    others that are not as recorded, by run, so that nothing of this is sure.
+    Attributes:
+        attributes: Attributes of the level that differed before the cycle.
+        because: "state" (or parameters) if each run repeats its own message, "code" if the level's
+            code has changed since one of them, "chance" if the level does not repeat itself.
+        runs: Runs that do not repeat their own message.
+        strays: Mailboxes of other levels that differ from the recording, by run. If there are any,
+            the result is uncertain.
     """
 
     attributes: tuple[InBoth, ...]
@@ -43,8 +45,12 @@ class Repetition:
 
 
 class _Again(NamedTuple):
-    """A repeated cycle: the attributes of its level before it, the mailboxes that are not as
-    recorded, and whether it wrote the same each time.
+    """A repeated cycle of one run.
+
+    Attributes:
+        attributes: Attributes of the level before the cycle.
+        unlike: Mailboxes that differ from the recording.
+        is_equal: True if every repetition wrote the same.
     """
 
     attributes: Mapping[str, Any]
@@ -52,43 +58,47 @@ class _Again(NamedTuple):
     is_equal: bool
 
 
-def repeated(found: Divergence, cycle: UnlikeCycle) -> Repetition:
-    """Repeat a cycle in both runs. Raises `Failure` if that is impossible, with the reason."""
+def repeated(divergence: Divergence, cycle: UnlikeCycle) -> Repetition:
+    """Repeat a cycle in both runs.
+
+    Raises:
+        Failure: The cycle cannot be repeated. The message says why.
+    """
     if cycle.writer == CLOCK:
-        raise Failure("the clock wrote that message")
-    for run in found.runs:
+        raise Failure("the clock wrote that message, and only levels can be repeated")
+    for run in divergence.runs:
         if run.rack_config.clock.mode != "lockstep":
-            raise Failure(f"{run.folder} ran in real time")
-    until = found.unlike[cycle.mailbox].visible_at + 1
+            raise Failure(f"{run.folder} ran in real time, and only lockstep can be repeated")
+    until = divergence.unlike[cycle.mailbox].visible_at + 1
     with INTERRUPT.raising(), as_failure():
-        again = {run: _again(run, cycle, until) for run in found.runs}
-    others = [run for run in found.runs if cycle.mailbox in again[run].unlike]
-    is_chance = not all(again[run].is_equal for run in others)
-    layout = found.runs[0].layout
+        again_by_run = {run: _again(run, cycle, until) for run in divergence.runs}
+    not_repeating = [run for run in divergence.runs if cycle.mailbox in again_by_run[run].unlike]
+    is_chance = not all(again_by_run[run].is_equal for run in not_repeating)
+    layout = divergence.runs[0].layout
     strays = {
         str(run.folder): tuple(
-            name for name in again[run].unlike if layout.mailbox(name).writer != cycle.writer
+            name for name in again_by_run[run].unlike if layout.mailbox(name).writer != cycle.writer
         )
-        for run in found.runs
+        for run in divergence.runs
     }
-    because: Because = "code" if others else "state"
+    because: Because = "code" if not_repeating else "state"
     return Repetition(
-        attributes=tuple(unlike_values(*(again[run].attributes for run in found.runs))),
+        attributes=tuple(unlike_values(*(again_by_run[run].attributes for run in divergence.runs))),
         because="chance" if is_chance else because,
-        runs=tuple(str(run.folder) for run in others),
+        runs=tuple(str(run.folder) for run in not_repeating),
         strays={folder: names for folder, names in strays.items() if names},
     )
 
 
 def _again(run: Recording, cycle: UnlikeCycle, until: int) -> _Again:
-    """Repeat a cycle of a run until what it writes is visible."""
+    """Repeat a cycle of a run up to tick `until`, at which its message is visible."""
     with RunAgain(run, f"{run.folder} at tick {cycle.tick}", anyway=True) as again:
         attributes = again.levels(cycle.tick)[cycle.writer]
-        found = []
+        repetitions = []
         for _ in range(TIMES):
             with again.rack_at(until) as rack:
-                # Serial and chain of what it wrote.
+                # Serial and chain of the message that it wrote.
                 wrote = chains(rack.segment, until)[cycle.mailbox]
-                found.append((wrote, tuple(unlike_in(run, rack.segment, until))))
-    wrote, unlike = found[0]
-    return _Again(attributes, unlike, all(one == wrote for one, _ in found))
+                repetitions.append((wrote, tuple(unlike_in(run, rack.segment, until))))
+    wrote, differing = repetitions[0]
+    return _Again(attributes, differing, all(repetition == wrote for repetition, _ in repetitions))

@@ -1,4 +1,4 @@
-"""report.json and report.md of one run."""
+"""Collects the report of a run, report.json and report.md."""
 
 from __future__ import annotations
 
@@ -41,13 +41,17 @@ from rack.tools.report.task_times import task_times
 from rack.tools.timing.measured_response import system_response
 
 COMPARISON = "rack.tools.report.against"
-"""What compares two runs, by name: it brings what repeats them, which no report on one needs."""
+"""Module that compares two runs, by name, since it needs code that reports on one run do not."""
 
 
 @dataclass(frozen=True)
 class OtherRun:
-    """The run in a folder that one is compared with: from where the mailbox `of` first differs, or
-    any; and whether both may be repeated.
+    """The run with which a report compares its own.
+
+    Attributes:
+        folder: Folder of the other run.
+        mailbox: Mailbox whose first difference is explained, or "" for the earliest difference.
+        may_repeat: Whether both runs may be repeated to find the cause.
     """
 
     folder: Path
@@ -56,9 +60,14 @@ class OtherRun:
 
 
 def write_report(folder: Path, against: OtherRun | None = None) -> tuple[Document, str]:
-    """Write the report of the run in `folder` into it, and return it as data and as text.
+    """Write report.json and report.md into the folder of a run.
 
-    With another run, `against`, it says where the two diverge, and why.
+    Args:
+        folder: Folder of the run.
+        against: A run to compare with. The report then says where and why the two diverge.
+
+    Returns:
+        The report as data and as text.
     """
     recording = Recording(folder)
     report = report_of(recording)
@@ -79,19 +88,19 @@ def report_of(recording: Recording) -> Document:
     ended = recording.ended
     recording.adopt_kinds()
     origin = Origin.of(recording)
-    found = misses(recording)
-    last = max((int(rows["tick"][-1]) for rows in recording.cycles.values()), default=-1)
+    missed_cycles = misses(recording)
+    last_tick = max((int(rows["tick"][-1]) for rows in recording.cycles.values()), default=-1)
     response = system_response(recording)
-    report = _head(config, ended, last + 1, response)
+    report = _head(config, ended, last_tick + 1, response)
     if not ended:
-        # Without the end of the run in the recording, the trace has to do.
-        missed, skipped = counted(found)
+        # The end of the run is not recorded, so count the misses in the trace.
+        missed, skipped = counted(missed_cycles)
         report = replace(report, missed=missed, skipped=skipped)
     return replace(
         report,
         folder=str(recording.folder),
         continues=None if origin is None else origin.document(layout.clock_ns),
-        misses=found,
+        misses=missed_cycles,
         steal=steal(recording),
         stalls=asdict(stalls_of(recording)[0]),
         frequency_mhz=frequency(recording),
@@ -119,8 +128,9 @@ def report_of(recording: Recording) -> Document:
 
 
 def unrecorded(config: RackConfig, ended: Mapping[str, Any]) -> Document:
-    """Return the report of a run that was not recorded: the same keys, null where only a recording
-    could tell.
+    """Return the report of a run without a recording.
+
+    It has the same keys, but null for everything that needs a recording.
     """
     layout = wire(config)
     head = _head(config, ended, 0, None)
@@ -138,8 +148,13 @@ def unrecorded(config: RackConfig, ended: Mapping[str, Any]) -> Document:
 def _head(
     config: RackConfig, ended: Mapping[str, Any], ticks: int, response: Document | None
 ) -> RunReport:
-    """Return the part that needs no recording; `ticks` is the length of a run whose end is not
-    known.
+    """Return the part of a report that needs no recording.
+
+    Args:
+        config: Config of the run.
+        ended: Counts at the end of the run. Empty if the end is not known.
+        ticks: Length of a run whose end is not known.
+        response: Measured response of the system, or None.
     """
     outcome = ended.get("outcome", {})
     counters = ended.get("tasks", {}).values()
@@ -161,6 +176,7 @@ def _head(
 
 
 def _task(recording: Recording, config: RackConfig, task: TaskSpec) -> Document:
+    """Return the entry of a task: its place in the rack, counts and times."""
     is_lockstep = config.clock.mode == "lockstep"
     layout = recording.layout
     cycles = recording.trace(task.name)
@@ -177,31 +193,35 @@ def _task(recording: Recording, config: RackConfig, task: TaskSpec) -> Document:
 
 
 def plan_ages_ms(recording: Recording, board: str) -> np.ndarray:
-    """Return the age of the plan that each cycle of a board's executor could read, simulated time;
-    see `plan_ages`.
+    """Return the age of the plan that each cycle of an executor could read, in simulated time.
+
+    See `plan_ages`.
     """
     plan = f"{board}.plan"
-    made = recording.signal(plan, "tick")
+    plan_ticks = recording.signal(plan, "tick")
     visible_at = recording.signal(plan, "visible_at")
     ticks = recording.trace(board)["tick"]
-    own = recording.stretch_of(ticks)
-    plans = recording.stretch_of(made)
-    found = [
-        plan_ages(ticks[own == at], made[plans == at], visible_at[plans == at])
-        for at in np.unique(plans)
+    cycle_stretches = recording.stretch_of(ticks)
+    plan_stretches = recording.stretch_of(plan_ticks)
+    ages = [
+        plan_ages(
+            ticks[cycle_stretches == stretch],
+            plan_ticks[plan_stretches == stretch],
+            visible_at[plan_stretches == stretch],
+        )
+        for stretch in np.unique(plan_stretches)
     ]
-    return np.concatenate(found) * (recording.layout.clock_ns * 1e-6)
+    return np.concatenate(ages) * (recording.layout.clock_ns * 1e-6)
 
 
 def _about(task: TaskSpec, layout: Layout) -> Document:
+    """Return role, slot and rate of a task."""
     return {"role": task.role, "slot": task.slot, "rate_hz": 1e9 / (task.every * layout.clock_ns)}
 
 
 def _entries(recording: Recording) -> list[Document]:
-    """Return the entries of all bus adapters: their counts at the end, and the ages of what passed,
-    ms.
-    """
-    found = []
+    """Return the entries of all bus adapters: their final counts and the ages of messages, ms."""
+    entries = []
     tick_ms = recording.layout.clock_ns * 1e-6
     for mailbox, entry, source in entries_of(recording.layout, recording.config):
         if mailbox in recording.mailboxes:
@@ -209,22 +229,23 @@ def _entries(recording: Recording) -> list[Document]:
             counts = {name: _last(recording, mailbox, f"{entry}.{name}") for name in ENTRY_COUNTS}
             name = f"{mailbox.partition('.')[0]}.{entry}"
             ages_ms = distribution(ages[ages >= 0] * tick_ms)
-            found.append({"entry": name, "source": source, **counts, "age_ms": ages_ms})
-    return found
+            entries.append({"entry": name, "source": source, **counts, "age_ms": ages_ms})
+    return entries
 
 
 def network(recording: Recording) -> Document | None:
-    """Return counts and ages, ms, of what passed, and losses of other racks; None: no adapter, or
-    nothing recorded.
+    """Return the traffic with other racks, with ages in ms, and the losses of these racks.
+
+    None if the rack has no network adapter, or nothing of it was recorded.
     """
-    entries = exchanged(recording.config)
-    if entries is None or STATUS not in recording.mailboxes:
+    exchange = exchanged(recording.config)
+    if exchange is None or STATUS not in recording.mailboxes:
         return None
     imports = []
-    for port, source in entries.imports.items():
+    for port, source in exchange.imports.items():
         ages_s = recording.signal(STATUS, f"import_{port}.age_s")
         counts = {name: _last(recording, STATUS, f"import_{port}.{name}") for name in COUNTS}
-        # In every cycle of the adapter, not of each message: between two it grows.
+        # The age at every cycle of the adapter. It grows until the next message comes.
         ages = distribution(ages_s[ages_s >= 0.0] * 1e3)
         imports.append({"entry": f"{BOARD}.{port}", "source": source, **counts, "age_ms": ages})
     exports = [
@@ -233,13 +254,14 @@ def network(recording: Recording) -> Document | None:
             "source": source,
             "sent": _last(recording, STATUS, f"export_{port}.sent"),
         }
-        for port, source in entries.exports.items()
+        for port, source in exchange.exports.items()
     ]
-    peers = [_peer(recording, rack) for rack in entries.peers]
+    peers = [_peer(recording, rack) for rack in exchange.peers]
     return {"imports": imports, "exports": exports, "peers": peers}
 
 
 def _peer(recording: Recording, rack: str) -> Document:
+    """Return the final state of another rack, and how often and how long it was lost."""
     mailbox = f"{BOARD}.{peer_port(rack)}"
     presence = recording.signal(mailbox, "presence")
     cycle_s = recording.layout.task(BOARD).every * recording.layout.clock_ns * 1e-9

@@ -1,4 +1,4 @@
-"""A report as text: report.md with every column, and on a terminal as many as fit."""
+"""A report as text: report.md with all columns, and a terminal with the columns that fit."""
 
 from __future__ import annotations
 
@@ -24,26 +24,26 @@ from rack.tools.report.run_report import RunReport
 from rack.tools.report.task_times import times_text
 
 SHOWN = 10
-"""Most misses, holds and long responses in the text; report.json has them all."""
+"""Number of misses, holds and long responses in the text. report.json contains all."""
 JUDGED = {True: "ok", False: "beyond", None: "-"}
 CHANGED = 1.05
-"""Ratio of a core's highest to its lowest frequency from which the text mentions it."""
+"""Ratio of a core's highest to its lowest frequency above which the text mentions it."""
 
 
 def markdown(report: Document) -> str:
-    """Return report.md of a report."""
+    """Return the text of report.md."""
     return render_markdown(report_blocks(report))
 
 
 def terminal_blocks(report: Document) -> Blocks:
-    """Yield a report for a terminal, with the files that hold the rest."""
+    """Yield a report for a terminal, with the names of the files that contain the rest."""
     yield from report_blocks(report)
     yield ""
     yield f"all columns: {report['folder']}/report.md; all data: report.json"
 
 
 def summary(document: Document) -> Iterator[str]:
-    """Yield the verdict, and what is known of a run that was not recorded, too."""
+    """Yield the verdict and the figures that are known even without a recording."""
     report = RunReport.of(document)
     yield f"# {headline(report.rack, report.outcome, report.failures)}"
     yield ""
@@ -53,8 +53,8 @@ def summary(document: Document) -> Iterator[str]:
         f"{f' Digest `{report.digest}`.' if report.digest else ''}"
     )
     yield from (f"- not judged: {line}" for line in report.unjudged)
-    if found := (report.outcome or {}).get("brakings"):
-        yield f"- {braked_text([Braking(**one) for one in found])}"
+    if brakings := (report.outcome or {}).get("brakings"):
+        yield f"- {braked_text([Braking(**braking) for braking in brakings])}"
 
 
 def report_blocks(document: Document) -> Blocks:
@@ -75,8 +75,8 @@ def report_blocks(document: Document) -> Blocks:
         yield from _misses(report)
     if (response := report.system_response) is not None:
         yield from ("", "## System response, ms of simulated time")
-        for found in (response, *response["others"]):
-            yield from _response_along(found)
+        for chain in (response, *response["others"]):
+            yield from _response_along(chain)
     if report.entries:
         yield from ("", "## Bus adapters, ages in ms of simulated time", "")
         yield _passed(report.entries, ("superseded", "waiting", "source"))
@@ -84,9 +84,9 @@ def report_blocks(document: Document) -> Blocks:
 
 
 def _notes(report: RunReport) -> Iterator[str]:
-    """Yield what the run began from and ran on, and what the recording lacks."""
-    if found := report.continues:
-        yield f"- continues {found['folder']} from {found['time_s']:g} s"
+    """Yield notes on the origin of the run, on the machine, and on gaps of the recording."""
+    if origin := report.continues:
+        yield f"- continues {origin['folder']} from {origin['time_s']:g} s"
     yield from (f"- {note}" for note in report.notes)
     yield from _machine(report)
     if report.recording != "complete":
@@ -101,11 +101,12 @@ def _notes(report: RunReport) -> Iterator[str]:
 
 
 def _the_most(rows: Sequence[Any], which: str) -> str:
-    """Return, for a heading, which of the rows are shown; "" if all are."""
+    """Return the part of a heading that says which rows are shown, or "" if all are."""
     return f"; the {which} {SHOWN}" if len(rows) > SHOWN else ""
 
 
 def _holds(rack: str, holds: Sequence[Document]) -> Blocks:
+    """Yield the section with the longest holds, and commands that release an operator's holds."""
     yield from ("", f"## Holds: {len(holds)}{_the_most(holds, 'longest')}", "")
     rows = [
         {
@@ -128,14 +129,13 @@ def _holds(rack: str, holds: Sequence[Document]) -> Blocks:
 
 
 def _state_tables(levels: dict[str, list[Document]]) -> TextTable:
-    """Return one line a level: the table, how many rows fired, and those that fired first and
-    last.
-    """
+    """Return a table with one line per level: its state table, and which rows fired."""
     rows = []
     for level, fired in levels.items():
-        most = max(fired, key=lambda row: row["cycles"])
+        most_frequent = max(fired, key=lambda row: row["cycles"])
         often, newest = (
-            f"{row['row']} {row['name']}, {row['first_s']:.2f} s" for row in (most, fired[-1])
+            f"{row['row']} {row['name']}, {row['first_s']:.2f} s"
+            for row in (most_frequent, fired[-1])
         )
         rows.append(
             {
@@ -151,25 +151,23 @@ def _state_tables(levels: dict[str, list[Document]]) -> TextTable:
 
 
 def _machine(report: RunReport) -> Iterator[str]:
-    """Yield what the machine did to its cores: when they were away, by whom if that is known;
-    changes of frequency.
-    """
+    """Yield notes on absences of cores, with their causes if known, and on changed frequencies."""
     steal = report.steal
     stalls = report.stalls
     frequency = report.frequency_mhz or {}
-    lost = f"of {stalls['lost']} lost cycles were due meanwhile"
+    lost = f"of {stalls['lost']} lost cycles were due at these times"
     if steal["ms"]:
         cores = ", ".join(f"core {core} for {steal['percent'][core]:.2f} %" for core in steal["ms"])
         yield f"- the hypervisor took {cores} of the run (steal); {stalls['during_steal']} {lost}"
-    for away in stalls["absences"]:
-        times = f"stalls: {away['times']}, longest {away['longest_ms']:.3g} ms"
-        nothing = f"core {away['core']} ran nothing of the rack though it was due, without steal"
-        yield f"- {nothing} ({times}); {away['lost']} {lost}"
+    for absence in stalls["absences"]:
+        details = f"stalls: {absence['times']}, longest {absence['longest_ms']:.3g} ms"
+        where = f"core {absence['core']} was away although no steal was counted"
+        yield f"- {where} ({details}); {absence['lost']} {lost}"
     if quota := stalls["quota"]:
         causes = [*(f"the cycle of {level}" for level in quota["levels"]), "a quota of the host"]
         yield (
-            f"- {quota['together']} of {quota['stalls']} stalls end at one phase of 100 ms:"
-            f" {' or '.join(causes)}"
+            f"- {quota['together']} of {quota['stalls']} stalls end at the same phase of a 100 ms"
+            f" period, which suggests {' or '.join(causes)}"
         )
     changed = {core: mhz for core, mhz in frequency.items() if mhz["max"] > CHANGED * mhz["min"]}
     if changed:
@@ -180,9 +178,10 @@ def _machine(report: RunReport) -> Iterator[str]:
 
 
 def _against(against: Document) -> Iterator[str]:
+    """Yield the comparison with another run."""
     difference = against["first_difference"]
     if difference is None:
-        yield f"- every message equals that of {against['folder']}"
+        yield f"- no message differs from {against['folder']}"
         return
     missed = against["first_miss_tick"]
     why = f"the first miss is at tick {missed}" if missed is not None else "neither run has a miss"
@@ -194,6 +193,7 @@ def _against(against: Document) -> Iterator[str]:
 
 
 def _faults(report: RunReport) -> Blocks:
+    """Yield the sections with faults, restarts and unexplained detections."""
     if faults := report.faults:
         yield from ("", f"## Faults: {len(faults)}", "")
         yield TextTable([_fault_row(fault) for fault in faults])
@@ -203,11 +203,12 @@ def _faults(report: RunReport) -> Blocks:
         yield from ("", f"## Unexplained detections: {len(unexplained)}", "")
         columns = {"tick": "tick", "found by": "board", "as": "code", "what": "text"}
         yield TextTable(
-            [{head: found[key] for head, key in columns.items()} for found in unexplained]
+            [{head: detection[key] for head, key in columns.items()} for detection in unexplained]
         )
 
 
 def _fault_row(fault: Document) -> dict[str, Cell]:
+    """Return the row of a fault in the table of faults."""
     unit = "cycles" if fault["bound_ms"] is None else "ms"
     after, bound = (
         "-" if fault[f"{key}_{unit}"] is None else f"{fault[f'{key}_{unit}']:.3g} {unit}"
@@ -228,17 +229,17 @@ def _fault_row(fault: Document) -> dict[str, Cell]:
 
 
 def _misses(report: RunReport) -> Blocks:
-    """Yield the first missed and skipped cycles, and why they are fewer than tasks counted."""
+    """Yield the section with the first missed cycles, and why some may not be listed."""
     misses = report.misses
     late, skipped = counted(misses)
     which = f"{late} and {skipped}{_the_most(misses, 'first')}"
     yield from ("", f"## Missed and skipped cycles: {which}", "")
     if (late, skipped) != (report.missed, report.skipped):
-        of_all = f"{report.missed} and {report.skipped}"
-        why = "the recording does not hold all of it"
+        counts = f"{report.missed} and {report.skipped}"
+        why = "the recording does not contain all of them"
         if report.rows_lost:
             why = "the recorder lost rows"
-        yield from (f"The tasks counted {of_all}; {why}.", "")
+        yield from (f"The tasks counted {counts}; {why}.", "")
     rows = [
         {
             "tick": miss["tick"],
@@ -253,6 +254,7 @@ def _misses(report: RunReport) -> Blocks:
 
 
 def _response_along(response: Document) -> Blocks:
+    """Yield the response along one chain of levels, with the responses that exceeded the bound."""
     yield ""
     bounds = (
         f"eq. 3.2 bound {response['bound_eq_3_2_ms']:g}, eq. 3.3 sum {response['sum_eq_3_3_ms']:g}"
@@ -262,35 +264,36 @@ def _response_along(response: Document) -> Blocks:
         " cycle."
     )
     yield ""
-    ways = {"command, down": response["command"], "status, up": response["status"]}
+    directions = {"command, down": response["command"], "status, up": response["status"]}
     rows = [
         {
             "way": (
-                way
-                if len(found["levels"]) == len(response["levels"])
-                else f"{way} from {found['levels'][0]}"
+                direction
+                if len(measured["levels"]) == len(response["levels"])
+                else f"{direction} from {measured['levels'][0]}"
             ),
-            "measured p50": figure(found["measured_ms"], "p50"),
-            "measured max": figure(found["measured_ms"], "max"),
-            "bound": found["bound_ms"],
-            "": JUDGED[found["holds"]],
+            "measured p50": figure(measured["measured_ms"], "p50"),
+            "measured max": figure(measured["measured_ms"], "max"),
+            "bound": measured["bound_ms"],
+            "": JUDGED[measured["holds"]],
         }
-        for way, found in ways.items()
-        if found["levels"]
+        for direction, measured in directions.items()
+        if measured["levels"]
     ]
     yield TextTable(rows)
-    for way, found in ways.items():
-        if beyond := found["beyond"]:
-            most = _the_most(beyond, "longest")
-            yield from ("", f"{way}: {len(beyond)} beyond the bound{most}:")
-        for each in sorted(beyond, key=lambda each: -each["ms"])[:SHOWN]:
-            why = "; ".join(each["delayed_by"]) or "no cause is recorded"
-            yield f"- {each['ms']:g} ms from tick {each['tick']}: {why}"
-        if unseen := found["unseen"]:
-            yield from ("", f"{way}: {unseen} not measured: messages are missing in the recording.")
+    for direction, measured in directions.items():
+        if exceeding := measured["beyond"]:
+            selection = _the_most(exceeding, "longest")
+            yield from ("", f"{direction}: {len(exceeding)} exceeded the bound{selection}:")
+        for slow in sorted(exceeding, key=lambda slow: -slow["ms"])[:SHOWN]:
+            why = "; ".join(slow["delayed_by"]) or "no cause is recorded"
+            yield f"- {slow['ms']:g} ms from tick {slow['tick']}: {why}"
+        if unseen := measured["unseen"]:
+            yield from ("", f"{direction}: {unseen} not measured, because messages are missing.")
 
 
 def _queues(queues: Sequence[Document]) -> Iterator[str]:
+    """Yield a sentence about each queue."""
     for queue in queues:
         refused = f", {queue['refused']} refused" if queue["refused"] else ""
         yield (
@@ -300,10 +303,11 @@ def _queues(queues: Sequence[Document]) -> Iterator[str]:
 
 
 def _interrupts(boards: Sequence[Document]) -> Iterator[str]:
+    """Yield a sentence about the interrupts of each board."""
     for board in boards:
         lost = f", {board['lost']} lost" if board["lost"] else ""
         latency = board["latency_us"]
-        took = (
+        latency_clause = (
             f"; {latency['p50']:g} us from sending to the end of service, at most"
             f" {latency['max']:g}"
             if latency
@@ -311,12 +315,12 @@ def _interrupts(boards: Sequence[Document]) -> Iterator[str]:
         )
         yield (
             f"Interrupts of {board['board']}: {board['served']} messages served, at most"
-            f" {board['waiting']} waiting, room for {board['depth']}{lost}{took}."
+            f" {board['waiting']} waiting, room for {board['depth']}{lost}{latency_clause}."
         )
 
 
 def _passed(rows: Sequence[Document], dropped: Sequence[str]) -> TextTable:
-    """Return what passed from side to side, and its ages."""
+    """Return a table of the messages that passed an adapter, and of their ages."""
     cells = [
         {
             **{name: count for name, count in row.items() if name != "age_ms"},
@@ -328,7 +332,7 @@ def _passed(rows: Sequence[Document], dropped: Sequence[str]) -> TextTable:
 
 
 def _network(network: Document | None) -> Blocks:
-    """Yield what passed over the network, and how often other racks were lost."""
+    """Yield the section with the traffic to other racks, and the losses of these racks."""
     if network is None:
         return
     yield from ("", "## Network, ages in ms of simulated time", "")

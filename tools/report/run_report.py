@@ -1,4 +1,4 @@
-"""The report of a run, as data: report.json has its fields."""
+"""The report of a run as a record with the fields of report.json."""
 
 from __future__ import annotations
 
@@ -10,12 +10,17 @@ from rack.tools.console.answer import Document
 
 @dataclass(frozen=True)
 class RunReport:
-    """The report of one run: how it ended, times of its tasks, and what happened in it.
+    """The report of a run: how it ended, the times of its tasks, and what happened in it.
 
-    None: only a recording could tell, or the rack has nothing of the kind. `worked` and `failures`
-    are the verdict, `unjudged` names what it leaves out. `tasks` are times by task, as from
-    `task_times`; `system_response` is that of `measured_response`. `against` compares the run with
-    another one.
+    A field is None if only a recording could tell, or if the rack has nothing of the kind.
+
+    Attributes:
+        worked: The verdict.
+        failures: Reasons of the verdict.
+        unjudged: Aspects that the verdict leaves out.
+        tasks: Times by task, from `compute_task_times`.
+        system_response: Result of `measured_response`.
+        against: Comparison with another run.
     """
 
     rack: str
@@ -66,10 +71,10 @@ class RunReport:
 
     @classmethod
     def of(cls, document: Document) -> RunReport:
-        """Return a report from its plain data."""
-        known: Document = {field.name: document.get(field.name) for field in fields(cls)}
-        return cls(**known)
+        """Return a report from its plain data. Missing keys become None."""
+        values: Document = {field.name: document.get(field.name) for field in fields(cls)}
+        return cls(**values)
 
     def document(self) -> Document:
-        """Return it as plain data."""
+        """Return the report as plain data."""
         return dict(vars(self))

@@ -1,5 +1,6 @@
-"""A report as `rack report` and `rack run` print it: the one in the run's folder as long as that is
-newer than the recording and this program.
+"""The report of `rack report` and `rack run`, which is reused while it is up to date.
+
+A stored report is up to date if it is newer than the recording and this program.
 """
 
 from __future__ import annotations
@@ -19,13 +20,14 @@ FLOORS = ("backplane", "levels", "boards", "tools")
 
 
 def stored_report(folder: Path) -> tuple[Document, str] | None:
-    """Return the report in the folder of a run, as data and as text; None if it must be made
-    anew, as of a recording that has been damaged since.
+    """Return the stored report of a run as data and as text.
+
+    None if the report must be made again, for example because the recording was damaged since.
     """
     try:
         checksums = Checksums(folder)
-        kept = (*FILES, *RECORDED)
-        checksums.verify(*(name for name in checksums.stored if name.startswith(kept)))
+        files = (*FILES, *RECORDED)
+        checksums.verify(*(name for name in checksums.stored if name.startswith(files)))
         made_ns = min((folder / name).stat().st_mtime_ns for name in FILES)
         program = (path for floor in FLOORS for path in (PROGRAM / floor).rglob("*.py"))
         basis = chain((folder / name for name in RECORDED), program)
@@ -36,18 +38,16 @@ def stored_report(folder: Path) -> tuple[Document, str] | None:
     except (OSError, ValueError, Failure):
         return None
     if not isinstance(data, dict) or data.get("against") or data.get("folder") != str(folder):
-        # A comparison with another run is no report of this one, or the folder has been moved.
+        # The report contains a comparison with another run, or the folder has been moved.
         return None
     return data, text
 
 
 def newest_report(folder: Path) -> tuple[Document, str]:
-    """Return the report of a run: the one in its folder if that is still right, otherwise a new
-    one.
-    """
+    """Return the stored report of a run, or a new one if that is missing or out of date."""
     report = stored_report(folder)
     if report is None:
-        # It takes long to import.
+        # This import takes long.
         from rack.tools.report.report import write_report
 
         report = write_report(folder)
@@ -60,8 +60,13 @@ def show_report(run: str | Path, as_json: bool) -> None:
 
 
 def print_report(data: Document, text: str, as_json: bool) -> None:
-    """Print a report: as one JSON document; on a terminal as much as fits; elsewhere, or of no
-    recording, `text`.
+    """Print a report.
+
+    Args:
+        data: The report as data.
+        text: The report as text.
+        as_json: Whether to print `data` as one JSON document. Otherwise a terminal gets the columns
+            that fit, and any other output gets `text`, as does a run without a recording.
     """
     if as_json:
         print_json(data)

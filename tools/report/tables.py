@@ -1,4 +1,4 @@
-"""An analysis as data, analysis.json, and as text: tables of levels, tasks and equations."""
+"""Analysis of a run, as data (analysis.json) and as text with tables."""
 
 from __future__ import annotations
 
@@ -20,8 +20,9 @@ _Side = LevelTiming | EquationVerdict | None
 
 
 def document(analysis: Analysis) -> Document:
-    """Return everything as plain data; infinite numbers are null. report.json has restarts and
-    the system's response.
+    """Return an analysis as plain data. Infinite numbers are null.
+
+    Restarts and the response of the system are in report.json.
     """
     recording = analysis.recording
     config = recording.rack_config
@@ -67,13 +68,18 @@ def document(analysis: Analysis) -> Document:
 
 
 def _sides(predicted: _Side, measured: _Side) -> Document:
+    """Return the predicted and the measured side as plain data."""
     sides = {"predicted": predicted, "measured": measured}
-    return {side: None if found is None else found.document() for side, found in sides.items()}
+    return {
+        side: None if side_timing is None else side_timing.document()
+        for side, side_timing in sides.items()
+    }
 
 
 def task_document(cycles: Cycles, rack: RackTiming) -> Document:
-    """Return the times of the judged cycles of one task, ms, as `task_times` of their processor
-    times.
+    """Return times of the judged cycles of a task, ms, with parts in processor time.
+
+    Includes all entries of `compute_task_times`.
     """
     judged = cycles.is_judged
     rows = cycles.rows[judged]
@@ -101,8 +107,9 @@ def task_document(cycles: Cycles, rack: RackTiming) -> Document:
 
 
 def analysis_blocks(analysis: Analysis, is_verbose: bool) -> Blocks:
-    """Yield an analysis as text: how the run ended, what held, and what to do; if verbose, every
-    level, task and equation.
+    """Yield an analysis as text: how the run ended, which equations held, and what to do.
+
+    If `is_verbose`, tables of all levels, tasks and equations follow.
     """
     yield from _head(analysis)
     if not is_verbose:
@@ -134,10 +141,12 @@ def analysis_blocks(analysis: Analysis, is_verbose: bool) -> Blocks:
 
 
 def _worst_words(percentile: float) -> str:
+    """Return a clause that names the percentile."""
     return "in the worst cycle" if percentile >= 100 else f"in {percentile:g} of 100 cycles"
 
 
 def _head(analysis: Analysis) -> Iterator[str]:
+    """Yield the summary: the end of the run, the equations, advice, and limitations."""
     config = analysis.recording.rack_config
     pairs = [pair for pair in analysis.pairs if pair.measured is not None]
     failing = [pair for pair in pairs if pair.fails]
@@ -164,17 +173,17 @@ def _head(analysis: Analysis) -> Iterator[str]:
 
 
 def _left_out(analysis: Analysis) -> Iterator[str]:
-    """Yield whatever was not judged."""
+    """Yield sentences about everything that was not judged."""
     config = analysis.recording.rack_config
     measured = analysis.measured.levels
-    if silent := ", ".join(name for name in config.board if name not in measured):
-        yield f"never ran: {silent}"
-    if planless := ", ".join(
+    if unused := ", ".join(name for name in config.board if name not in measured):
+        yield f"never ran: {unused}"
+    if without_plan := ", ".join(
         level.board
         for level in measured.values()
         if level.planning_ns is None and level.coupling != "none"
     ):
-        yield f"made no plan: {planless}"
+        yield f"made no plan: {without_plan}"
     yield (
         f"the first {START_UP_S:g} s of each process are not judged; t_cs is"
         f" {config.timing.context_switch_ms:g} ms"
@@ -182,7 +191,7 @@ def _left_out(analysis: Analysis) -> Iterator[str]:
     if stalled := ", ".join(
         f"{name} {cycles.stalled}" for name, cycles in analysis.cycles.items() if cycles.stalled
     ):
-        yield f"cycles with a stall in them are not judged: {stalled}"
+        yield f"stalled cycles are not judged: {stalled}"
     for name, (traced, ran) in analysis.recording.untraced().items():
         yield f"{name}: judged by {traced:,} of {ran:,} cycles"
     yield from (
@@ -196,7 +205,7 @@ def _left_out(analysis: Analysis) -> Iterator[str]:
 
 
 def _ended(analysis: Analysis) -> str:
-    """Return how the run ended, and the cycles that it missed."""
+    """Return a clause that says how the run ended and how many cycles it missed."""
     ended = analysis.recording.ended
     cause = ended.get("outcome", {}).get("cause", "no end recorded")
     counts = ended.get("tasks", {}).values()
@@ -208,7 +217,7 @@ def _ended(analysis: Analysis) -> str:
 
 
 def _advice(analysis: Analysis, failing: list[Pair]) -> str:
-    """Return what to do about equations that failed, or about a run that failed without them."""
+    """Return advice for failed equations, or for a run that failed although all equations held."""
     folder = analysis.recording.folder
     if not failing:
         outcome = analysis.recording.ended.get("outcome", {"cause": "time over"})
@@ -229,7 +238,7 @@ def _advice(analysis: Analysis, failing: list[Pair]) -> str:
 
 
 def _named(pairs: list[Pair]) -> str:
-    """Return equations by subject: "servo 3.1, 3.6; core 1 load"."""
+    """Join equations by subject, as in "servo 3.1, 3.6; core 1 load"."""
     subjects = dict.fromkeys(pair.subject for pair in pairs)
     named = {
         name: ", ".join(pair.equation for pair in pairs if pair.subject == name)

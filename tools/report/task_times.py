@@ -1,6 +1,4 @@
-"""Times of the cycles of tasks: as data, and as the one table that `rack report` and `rack analyze`
-show.
-"""
+"""Times of the cycles of tasks, as data and as the table of `rack report` and `rack analyze`."""
 
 from __future__ import annotations
 
@@ -30,8 +28,10 @@ BY_THE_CLOCK = {
     "deviation": ("deviation_ms", ""),
     "alpha": ("alpha_ms", ""),
 }
-"""Columns of times relative to a release or a time slice, which mean nothing in lockstep: the entry
-of a task, and the figure of its distribution."""
+"""Columns of times relative to a release or a time slice, which mean nothing in lockstep.
+
+Each gives the key in the entry of a task, and the figure of the distribution.
+"""
 USED = {
     "exec p50": ("execution_ms", "p50"),
     "exec p99": ("execution_ms", "p99"),
@@ -53,7 +53,7 @@ DROPPED = (
     "R",
     "cycles",
 )
-"""Columns that a narrow terminal leaves out, the first of them first."""
+"""Columns that a narrow terminal leaves out, in that order."""
 
 
 def task_times(
@@ -69,15 +69,15 @@ def task_times(
 
     `processor_ms` is the processor time of a cycle and of waking up for it, without waiting and
     preemption. A planner's cycles are its plans, and its R is their time slice. In lockstep a tick
-    lasts as long as its tasks take: everything relative to a release or a time slice is None.
+    lasts as long as its tasks take, so everything relative to a release or a time slice is None.
 
     Args:
         task: The task.
         cycles: Its trace records, shape (n,).
-        period_ns: One tick of the wall clock.
+        period_ns: Length of a tick on the wall clock.
         is_lockstep: Whether the run was in lockstep.
-        stretches: As in `gaps_ns`, shape (n,).
-        parts_ns: t_exec and t_comm of each cycle; None: as traced, by the wall clock.
+        stretches: Stretch of each cycle, as in `gaps_ns`, shape (n,).
+        parts_ns: t_exec and t_comm of each cycle. Defaults to the traced times on the wall clock.
     """
     slice_ns = task.slice * period_ns
     gaps = gaps_ns(cycles, stretches)
@@ -90,9 +90,9 @@ def task_times(
         "deviation_ms": None,
     }
     if len(cycles):
-        # Eq. 3.6: alpha is the residual guaranteed in the worst cycle, though the longest execution
-        # and the longest communication may fall into different ones; smooth motion needs a small
-        # deviation.
+        # Eq. 3.6: alpha is the residual guaranteed in the worst case, even though the longest
+        # execution and the longest communication may come from different cycles. Smooth motion
+        # needs a small deviation.
         alpha_ns = slice_ns - int(execution.max()) - int(communication.max())
         by_the_clock["alpha_ms"] = round(alpha_ns * MS, 6)
         by_the_clock["deviation_ms"] = round(float((execution + communication).std()) * MS, 6)
@@ -107,7 +107,7 @@ def task_times(
 
 
 def times_table(tasks: Mapping[str, Document], is_lockstep: bool) -> TextTable:
-    """Return a line per task, without what means nothing in lockstep."""
+    """Return a table with one line per task. Leaves out columns that mean nothing in lockstep."""
     columns = USED if is_lockstep else BY_THE_CLOCK | USED
     rows = [
         {
@@ -115,8 +115,8 @@ def times_table(tasks: Mapping[str, Document], is_lockstep: bool) -> TextTable:
             "R": task["slice_ms"],
             **{key: task.get(key) for key in ("cycles", "missed", "skipped")},
             **{
-                column: figure(task.get(key), part) if part else decimal(task[key])
-                for column, (key, part) in columns.items()
+                column: figure(task.get(key), quantile) if quantile else decimal(task[key])
+                for column, (key, quantile) in columns.items()
             },
         }
         for name, task in tasks.items()
@@ -125,13 +125,13 @@ def times_table(tasks: Mapping[str, Document], is_lockstep: bool) -> TextTable:
 
 
 def times_text(report: RunReport) -> Blocks:
-    """Yield the table of cycles."""
+    """Yield the section of a report with the table of cycles."""
     is_lockstep = report.mode == "lockstep"
     yield from ("", "## Cycles, ms", "")
     if is_lockstep:
         yield (
-            "In lockstep a tick lasts as long as its tasks take: there are no deadlines, no"
-            " lateness, no residuals."
+            "In lockstep a tick lasts as long as its tasks take, so there are no deadlines, no"
+            " lateness and no residuals."
         )
         yield ""
     for name, (traced, ran) in report.untraced.items():

@@ -1,6 +1,4 @@
-"""The first view of one run or several: the blueprint of all views, the place of the eye, the
-config as a document.
-"""
+"""The initial view of one run or several: all views, their layout, and the position of the eye."""
 
 from __future__ import annotations
 
@@ -42,25 +40,25 @@ from rack.tools.viewer.timing import BOARDS, boards_of
 
 CONFIG = "config"
 DIMMED = rr.SeriesLines(colors=[0x9A9A9AFF])
-"""Look of the curves of a run with which another one is compared."""
+"""Style of the curves of a run with which another run is compared."""
 LOG_COLUMNS = rrb.TextLogColumns(timeline_columns=[SIM_TIME], text_log_columns=["loglevel", "body"])
 CYCLES = "boards, cycle by cycle: R read, X process, P plan, W write"
 CYCLES_S = 0.022
-"""Time before and after the cursor in the Gantt lanes: some cycles of fast and of slower boards."""
+"""Time shown before and after the cursor in the Gantt lanes: several cycles of most boards."""
 DIRECTION = np.array([0.75, -0.95, 0.55])
-"""From the cell to the eye: from the front right, slightly above."""
+"""Direction from the cell to the eye: from the front right, slightly from above."""
 DISTANCE = 2.05
-"""In radii of arm and objects, so that they fill the view, including a raised arm."""
+"""Distance of the eye, in radii of arm and objects, so that a raised arm fits into the view."""
 TITLES = {TENSIONS: "tensions: flexors bright, extensors dim"}
-"""Titles of the curves of fingers that say more than what they are of."""
+"""Titles of finger curves that say more than the name of the quantity."""
 ABOVE_M = 0.01
-"""From the floor to the grid on it: at the same height the floor would hide it."""
+"""Height of the grid above the floor, which would hide a grid at the same height."""
 GRID_M = 0.25
-"""Between lines of the grid."""
+"""Distance between lines of the grid."""
 
 
 def blueprint(root: rrb.Container, live: bool = False) -> rrb.Blueprint:
-    """Return the blueprint of a view; `live` follows the newest data."""
+    """Return the blueprint of a view. If `live`, it follows the newest data."""
     play = PlayState.Following if live else PlayState.Paused
     return rrb.Blueprint(
         root,
@@ -73,15 +71,18 @@ def blueprint(root: rrb.Container, live: bool = False) -> rrb.Blueprint:
 
 
 def together(racks: Mapping[str, RackViews]) -> rrb.Container:
-    """Return the view of several racks, by name: all at once above the log of all, and in further
-    tabs each by itself.
+    """Return the view of several racks, by name.
+
+    The first tab shows all racks above a common log; further tabs show one rack each.
     """
     return _all_and_each(racks, "all racks", _log(racks, "racks"), [4, 1])
 
 
 def side_by_side(runs: Mapping[str, RackViews]) -> rrb.Container:
-    """Return the view of two runs of one rack, by name: as of several racks, and the curves of both
-    in the same plots, those of the first run in grey.
+    """Return the view of two runs of the same rack, by name.
+
+    The first tab shows both runs and plots with the curves of both, the first run's in grey.
+    Further tabs show one run each.
     """
     first, other = runs.values()
     names = "{} in grey, {} in colour".format(*runs)
@@ -97,15 +98,23 @@ def side_by_side(runs: Mapping[str, RackViews]) -> rrb.Container:
 def _all_and_each(
     racks: Mapping[str, RackViews], name: str, below: rrb.Container | rrb.View, shares: list[float]
 ) -> rrb.Container:
-    """Return a column for each rack, its cell above what its levels do, and `below` them something
-    of all; in further tabs each rack by itself.
+    """Return a tab with all racks side by side, and further tabs with one rack each.
+
+    Args:
+        racks: Views of the racks, by name.
+        name: Title of the first tab.
+        below: View below the racks in the first tab.
+        shares: Heights of the racks and of that view.
     """
     columns = rrb.Horizontal(*(views.column(rack) for rack, views in racks.items()))
-    shown = rrb.Vertical(columns, below, row_shares=shares, name=name)
-    return rrb.Tabs(shown, *(views.everything(rack) for rack, views in racks.items()), active_tab=0)
+    first_tab = rrb.Vertical(columns, below, row_shares=shares, name=name)
+    return rrb.Tabs(
+        first_tab, *(views.everything(rack) for rack, views in racks.items()), active_tab=0
+    )
 
 
 def _log(racks: Mapping[str, RackViews], what: str) -> rrb.View:
+    """Return a view with the log lines of all racks."""
     logs = [f"{path(LOG)}/**", *(views.all(LOG) for views in racks.values())]
     return rrb.TextLogView(
         origin="/", contents=logs, name=f"log of all {what}", columns=LOG_COLUMNS
@@ -113,7 +122,10 @@ def _log(racks: Mapping[str, RackViews], what: str) -> rrb.View:
 
 
 class RackViews:
-    """The views of one rack: its cell in 3D, curves, lanes, log. Its entities are below `root`."""
+    """Builds the views of one rack: its cell in 3D, curves, lanes and log.
+
+    The entities of the rack are below `root`.
+    """
 
     def __init__(
         self, layout: Layout, config: RackConfig, cell: Cell | None, root: Sequence[str] = ()
@@ -133,13 +145,15 @@ class RackViews:
         return path(*self._root, *entity)
 
     def all(self, *entity: str) -> str:
-        """Return the query for an entity and all below it."""
+        """Return the query for an entity and everything below it."""
         return f"{self.path(*entity)}/**"
 
     def everything(self, name: str | None = None) -> rrb.Container:
-        """Return all views."""
-        doing = lanes_view("levels and events, whole run", [self.all(EVENTS), self.all(LEVELS)])
-        below = rrb.Tabs(doing, self._graph(), active_tab=0)
+        """Return all views of the rack. `name` is the title of its tab."""
+        level_lanes = lanes_view(
+            "levels and events, whole run", [self.all(EVENTS), self.all(LEVELS)]
+        )
+        below = rrb.Tabs(level_lanes, self._graph(), active_tab=0)
         left: rrb.Container = below
         if self._cell is not None:
             left = rrb.Vertical(self._scene(self._cell, "cell"), below, row_shares=[11, 9])
@@ -165,21 +179,22 @@ class RackViews:
         return rrb.Horizontal(left, right, column_shares=[2, 3], name=name)
 
     def main_curves(self) -> dict[str, list[str]]:
-        """Return the entities whose curves show what a run did, by the title of a plot: those of
-        the arm or, without one, all signals.
+        """Return the entities of the curves that describe a run, by title of their plot.
+
+        They are the curves of the arm or, without an arm, all signals.
         """
         if not self._joints:
             boxes = self._layout.mailboxes
             fields = [(box.name, field.name) for box in boxes for field in box.fields]
             return {"signals": [self.path(SIGNALS, *names) for names in fields]}
-        found = {
+        by_quantity = {
             f"{quantity}, {unit}": [self.path(JOINTS, name, quantity) for name in self._joints]
             for quantity, unit in QUANTITIES.items()
         }
-        return {"tracking error, mrad": [self.path(ERROR)], **found}
+        return {"tracking error, mrad": [self.path(ERROR)], **by_quantity}
 
     def column(self, name: str) -> rrb.Container | rrb.View:
-        """Return the cell, if there is one, above what the levels do."""
+        """Return the cell, if there is one, above the lanes of the levels."""
         levels = lanes_view(f"{name}: levels", [self.all(LEVELS)])
         if self._cell is None:
             return levels
@@ -196,28 +211,32 @@ class RackViews:
         )
 
     def _arm(self) -> rrb.Container:
-        """Return a view of all joints for each quantity, and in a second tab one of each joint with
-        its limits.
+        """Return plots of the arm.
+
+        Each quantity has a plot of all joints, and in a second tab a plot of each joint with its
+        limits.
         """
-        error, *together = (_curves(*curves) for curves in self.main_curves().items())
+        error, *plots = (_curves(*curves) for curves in self.main_curves().items())
         views = [
             rrb.Tabs(
-                shown,
+                plot,
                 rrb.Grid(
                     *(self._joint(name, quantity) for name in self._joints),
                     name="by joint, with limits",
                 ),
             )
-            for shown, quantity in zip(together, QUANTITIES, strict=True)
+            for plot, quantity in zip(plots, QUANTITIES, strict=True)
         ]
-        own = rrb.Tabs(*self._requests(), *self._forces(), error, *self._gripper(), active_tab=0)
+        other_plots = rrb.Tabs(
+            *self._requests(), *self._forces(), error, *self._gripper(), active_tab=0
+        )
         legend = self._legend(JOINTS, "joints", self._joints)
-        return rrb.Horizontal(rrb.Grid(*views, own, grid_columns=2), legend, column_shares=[9, 1])
+        return rrb.Horizontal(
+            rrb.Grid(*views, other_plots, grid_columns=2), legend, column_shares=[9, 1]
+        )
 
     def _requests(self) -> list[rrb.Container]:
-        """Return the queue of a level that follows motion requests, and its error at a goal that
-        moves.
-        """
+        """Return plots of the queues of levels that follow motion requests, and of moving goals."""
         return [
             rrb.Horizontal(
                 _curves("taken and done", self._fields(box, "taken", "done")),
@@ -229,7 +248,7 @@ class RackViews:
         ]
 
     def _gripper(self) -> list[rrb.View]:
-        """Return the views of the gripper's opening and force."""
+        """Return plots of the gripper's opening and force. Empty without a gripper."""
         if self._cell is None or self._cell.gripper is None:
             return []
         units = zip((OPENING, GRIP), gripper_units(self._cell), strict=True)
@@ -242,10 +261,11 @@ class RackViews:
         return [self.path(SIGNALS, mailbox.name, name) for name in names]
 
     def _legend(self, what: str, name: str, names: Sequence[str]) -> rrb.View:
+        """Return the view of a legend."""
         return legend_view(self.path(LEGEND, what), name, names)
 
     def _forces(self) -> list[rrb.View]:
-        """Return the views of forces, of an arm or hand that senses them."""
+        """Return plots of contact forces. Empty without a wrist sensor."""
         if self._cell is None or self._cell.wrist is None:
             return []
         views = [
@@ -263,8 +283,10 @@ class RackViews:
         return [along, *views, *contact]
 
     def _fingers(self, hand: Hand) -> rrb.Container:
-        """Return a view of every finger for tensions, joints and forces, each kind in a tab, and
-        one of all tips.
+        """Return plots of a hand.
+
+        Tabs contain a plot of every finger for tensions, joints and forces; beside them are the
+        forces of all fingertips.
         """
         tabs = [
             rrb.Grid(
@@ -291,14 +313,16 @@ class RackViews:
         )
 
     def _joint(self, name: str, quantity: str) -> rrb.View:
-        shown = [self.path(JOINTS, name, quantity), self.path(JOINTS, name, quantity, "limits")]
-        return _curves(f"{name}, {QUANTITIES[quantity]}", shown)
+        """Return a plot of one quantity of a joint, with its limits."""
+        entities = [self.path(JOINTS, name, quantity), self.path(JOINTS, name, quantity, "limits")]
+        return _curves(f"{name}, {QUANTITIES[quantity]}", entities)
 
     def _signals(self) -> rrb.View:
-        """Return the view of all fields; their units are with their names."""
+        """Return a plot of all fields. Its legend contains their units."""
         return _curves("signals", [self.all(SIGNALS)], True)
 
     def _load(self) -> rrb.Container | rrb.View:
+        """Return plots of the use of the time slices and of execution times."""
         times = self.all(timing.TIMES)
         if self._config.clock.mode == "lockstep":
             return _curves("execution, ms", [times])
@@ -306,7 +330,7 @@ class RackViews:
         return rrb.Tabs(use, _curves("late and execution, ms", [times]))
 
     def _ages(self) -> rrb.Container:
-        """Return the ages; plans, which may be old, have their own scale."""
+        """Return plots of ages. Plans have their own plot, because they may be much older."""
         boxes = [mailbox.name for mailbox in self._layout.mailboxes]
         plans = [self.path(timing.AGES, name) for name in boxes if name.endswith(".plan")]
         sampled = [self.all(timing.AGES), *(f"- {plan}" for plan in plans)]
@@ -317,6 +341,7 @@ class RackViews:
         )
 
     def _log(self) -> rrb.Container:
+        """Return tabs with the log, the config, and the recorder's load and losses."""
         log = rrb.TextLogView(origin=self.path(LOG), name="log", columns=LOG_COLUMNS)
         config = rrb.TextDocumentView(origin=self.path(CONFIG), name="config")
         load = _curves("recorder, % of a core", [self.path(RECORDER, "load")])
@@ -324,6 +349,7 @@ class RackViews:
         return rrb.Tabs(log, config, load, lost)
 
     def _graph(self) -> rrb.View:
+        """Return the view of the hierarchy."""
         places = positions(self._layout, rack_timing(self._config, self._layout)).values()
         columns, rows = zip(*places, strict=True)
         bounds = rrb.VisualBounds2D(
@@ -339,28 +365,34 @@ def _curves(
     legend: bool = False,
     overrides: Mapping[EntityPathLike, rr.SeriesLines] | None = None,
 ) -> rrb.View:
+    """Return a plot of curves.
+
+    Args:
+        name: Title of the plot.
+        contents: Queries for its entities.
+        legend: Whether to show a legend.
+        overrides: Styles that replace those in the recording, by entity.
+    """
     axis = rrb.TimeAxis(link="LinkToGlobal")
-    shown = rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=legend)
+    legend_style = rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=legend)
     return rrb.TimeSeriesView(
         origin="/",
         contents=contents,
         name=name,
         axis_x=axis,
-        plot_legend=shown,
+        plot_legend=legend_style,
         overrides=overrides,
     )
 
 
 def grid_on(cell: Cell) -> rrb.LineGrid3D:
-    """Return a grid on the floor of a cell; without a floor, at the height of the world's
-    origin.
-    """
+    """Return a grid on the floor of a cell, or at the height of the origin without a floor."""
     plane = rr.components.Plane3D((0.0, 0.0, 1.0), floor_of(cell) + ABOVE_M)
     return rrb.LineGrid3D(visible=True, plane=plane, spacing=GRID_M, color=GRID)
 
 
 def eye_on(cell: Cell) -> rrb.EyeControls3D:
-    """Return the place from which the eye sees the arm and its objects, at their start, large."""
+    """Return an eye position from which the arm and its objects fill the view at the start."""
     centre, radius = extent_of(cell)
     position = centre + DISTANCE * radius * DIRECTION / np.linalg.norm(DIRECTION)
     return rrb.EyeControls3D(
@@ -369,7 +401,14 @@ def eye_on(cell: Cell) -> rrb.EyeControls3D:
 
 
 def write_document(stream: Stream, text: str, config: RackConfig, layout: Layout) -> None:
-    """Log the resolved config, and the properties of the run."""
+    """Log the resolved config and the properties of the run.
+
+    Args:
+        stream: Where they are written.
+        text: The config as text.
+        config: The config.
+        layout: Layout of the rack.
+    """
     stream.static((CONFIG,), rr.TextDocument(f"```toml\n{text}```", media_type="text/markdown"))
     robot = config.robot.model.stem if config.robot else "none"
     values = rr.AnyValues(

@@ -1,5 +1,6 @@
-"""The cell in 3D: its geoms, each once, in the frame of its body; poses of moving bodies; pushes;
-path and goals.
+"""The cell in 3D: geoms, poses of moving bodies, pushes, marks, planned path and goals.
+
+Each geom is written once, in the frame of its body.
 """
 
 from __future__ import annotations
@@ -26,7 +27,10 @@ COLLISION = "collision"
 FRAMES = "frames"
 WORLD = "world"
 SHOWN_GROUPS = 3
-"""MuJoCo's own viewer shows groups 0, 1, 2; by convention those above hold collision shapes."""
+"""Number of geom groups that are shown.
+
+MuJoCo's own viewer shows groups 0, 1 and 2. By convention, higher groups contain collision shapes.
+"""
 TOOL = (CELL, "tool")
 TOOL_COLOUR = 0xE63CC8FF
 PATH = (CELL, "planned_path")
@@ -34,24 +38,29 @@ WAYPOINTS = (CELL, "way_points")
 GOALS = (CELL, "goals")
 CURRENT_GOAL = (CELL, "current_goal")
 STEP_RAD = 0.03
-"""A straight line in joint space is a curve of the tool: it is drawn in pieces of at most this
-length."""
+"""Longest joint motion between two points of a drawn path.
+
+A straight line in joint space is a curve of the tool, so it is drawn in short pieces.
+"""
 POINT_M = 0.008
 LINE_M = 0.003
 BRAKES = (CELL, "brakes")
 FAULTS = (CELL, "faults")
 MARK_PART = 0.09
-"""Radius of a mark, as a part of that of arm and objects: larger than a link is thick."""
+"""Radius of a mark, relative to the radius of arm and objects. Marks are thicker than a link."""
 AXES = (CELL, "axes")
 AXES_PART = 0.25
 AXES_RADIUS_PART = 0.0125
 AXES_BESIDE = np.array([-0.6, -0.45, 0.0])
-"""Length, radius and place of the axes, in radii of arm and objects: left of the arm."""
+"""Length, radius and position of the axes, relative to the radius of arm and objects.
+
+The axes are left of the arm.
+"""
 AXES_COLOURS = (0xE64646FF, 0x46B45AFF, 0x468CE6FF)
 PUSHES = (CELL, "pushes")
 PUSH_M = 0.02
 PUSH_RADIUS_M = 0.0015
-"""Length of the arrow of a push for each N, and its radius."""
+"""Length of a push's arrow per newton, and its radius."""
 
 
 def frame_of(model: mujoco.MjModel, body: int) -> str:
@@ -60,18 +69,16 @@ def frame_of(model: mujoco.MjModel, body: int) -> str:
 
 
 def moving_bodies(model: mujoco.MjModel) -> Ints:
-    """Return the bodies moved by joints or as mocap bodies, and all attached to them."""
+    """Return the bodies that joints or mocap poses move, including all bodies attached to them."""
     moves = np.zeros(model.nbody, dtype=bool)
     for body in range(1, model.nbody):  # parents come first
-        own = model.body_jntnum[body] > 0 or model.body_mocapid[body] >= 0
-        moves[body] = own or moves[model.body_parentid[body]]
+        has_motion = model.body_jntnum[body] > 0 or model.body_mocapid[body] >= 0
+        moves[body] = has_motion or moves[model.body_parentid[body]]
     return np.flatnonzero(moves)
 
 
 def write_geometry(stream: Stream, cell: Cell) -> None:
-    """Log all geoms, the frames that never move with their poses at the start, and directions
-    of the world's axes.
-    """
+    """Log all geoms, the poses of frames that never move, and the directions of the axes."""
     model = cell.model
     data = cell.start()
     stream.static((CELL,), stream.within(WORLD))
@@ -109,8 +116,10 @@ def write_geometry(stream: Stream, cell: Cell) -> None:
 
 
 class Poses:
-    """Writes an `ArmState` as poses of all moving bodies, by MuJoCo's own kinematics, the path of
-    the tool, and, with `has_pushes`, the forces that the scene exerts on its objects.
+    """Writes an `ArmState` as poses of all moving bodies, and as the path of the tool.
+
+    The poses come from MuJoCo's kinematics. With `has_pushes` the forces that the scene exerts on
+    its objects are written as well.
     """
 
     def __init__(self, stream: Stream, cell: Cell, has_pushes: bool) -> None:
@@ -132,7 +141,7 @@ class Poses:
             stream.static(PUSHES, stream.within(WORLD))
 
     def write(self, block: RowBlock) -> None:
-        """Write poses, one every 20 ms of simulated time."""
+        """Write the poses, one every 20 ms of simulated time."""
         chosen = self._sampled_rows(block.ticks)
         data = self._data
         bodies = self._bodies
@@ -147,8 +156,8 @@ class Poses:
             mujoco.mj_kinematics(self._cell.model, data)
             positions[row, : len(bodies)] = data.xpos[bodies]
             quaternions[row, : len(bodies)] = data.xquat[bodies]
-            for at, contact in enumerate(self._contacts, len(bodies)):
-                positions[row, at], quaternions[row, at] = contact.pose(data)
+            for index, contact in enumerate(self._contacts, len(bodies)):
+                positions[row, index], quaternions[row, index] = contact.pose(data)
             tool[row] = data.site_xpos[self._cell.tool]
             if self._has_pushes:
                 self._push(block.when(chosen[row]))
@@ -162,7 +171,7 @@ class Poses:
         self._stream.columns((FRAMES,), block.times_of(np.repeat(chosen, count)), poses)
 
     def _push(self, when: Moment) -> None:
-        """Write the forces that act on the objects now, and that they have ended."""
+        """Write the forces that act on objects now, or that they have ended."""
         objects = self._cell.bodies
         forces = self._data.xfrc_applied[objects, :3]
         pushed = forces.any(axis=1)
@@ -178,14 +187,13 @@ class Poses:
 
 
 class Marks:
-    """Marks in red what stops the arm: joints whose brakes are engaged, and faults while they
-    act.
-    """
+    """Marks in red why the arm does not move: engaged brakes, and faults while they act."""
 
     def __init__(self, stream: Stream, cell: Cell, joints: Sequence[str]) -> None:
         self._stream = stream
         self._braking_rows = change_finder()
-        self._faults: dict[int, tuple[str, str]] = {}  # joint and text, by entry of the fault table
+        # Joint and text of each acting fault, by entry of the fault table.
+        self._faults: dict[int, tuple[str, str]] = {}
         self._joints = {name: cell.model.joint(name).pos for name in joints}
         self._radius = MARK_PART * extent_of(cell)[1]
         for name in joints:
@@ -194,7 +202,7 @@ class Marks:
                 stream.static((*group, name), stream.within(frame_of(cell.model, body)))
 
     def write(self, block: RowBlock) -> None:
-        """Mark every joint from when the brakes are engaged until they are released."""
+        """Mark every joint while the brakes are engaged."""
         braked = block.messages["braked"]
         for row in self._braking_rows(braked):
             texts = dict.fromkeys(self._joints, "") if braked[row] else {}
@@ -203,9 +211,7 @@ class Marks:
             self._mark(block.when(row), BRAKES, texts)
 
     def fault(self, when: Moment, event: Event) -> None:
-        """Mark the joint of a fault that begins, or the first joint for one of no joint, until it
-        ends.
-        """
+        """Mark the joint of a fault while it acts. A fault of no joint marks the first joint."""
         joint = event.subject if event.subject in self._joints else next(iter(self._joints))
         if event.code == "begins":
             text = event.text.partition(" begins")[0]
@@ -215,7 +221,7 @@ class Marks:
         self._mark(when, FAULTS, dict(self._faults.values()))
 
     def _mark(self, when: Moment, group: tuple[str, str], texts: dict[str, str]) -> None:
-        """Write a ball at each joint with a text, the text at those that say something."""
+        """Write a ball at each joint in `texts`, labelled with the text unless it is empty."""
         for name, place in self._joints.items():
             text = texts.get(name)
             places = [] if text is None else [place]
@@ -225,7 +231,7 @@ class Marks:
 
 
 def extent_of(cell: Cell) -> tuple[Array, float]:
-    """Return the middle of arm and objects at the start, (3,), m, and the radius around it, m."""
+    """Return the centre of arm and objects at the start, (3,), m, and their radius, m."""
     data = cell.start()
     model = cell.model
     geoms = np.union1d(
@@ -240,14 +246,15 @@ def extent_of(cell: Cell) -> tuple[Array, float]:
 
 
 def floor_of(cell: Cell) -> float:
-    """Return the height of the floor, m; without one that of the world's origin."""
+    """Return the height of the floor, m, or of the world's origin if the cell has no floor."""
     floors = np.flatnonzero(cell.model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
     return float(cell.start().geom_xpos[floors, 2].min(initial=0.0))
 
 
 def planned_path(stream: Stream, cell: Cell) -> ViewPart:
-    """Return the part that writes a `MovePlan` as a line of the tool point with its way points,
-    from the tick at which they are visible; a plan for the gripper clears the path.
+    """Return the part that shows a `MovePlan` as the path of the tool and its way points.
+
+    It is drawn from the tick at which the plan is visible. A plan for the gripper clears it.
     """
     data = cell.start()
     for entity in (PATH, WAYPOINTS):
@@ -260,12 +267,13 @@ def planned_path(stream: Stream, cell: Cell) -> ViewPart:
         return np.array(data.site_xpos[cell.tool])
 
     def write(block: RowBlock) -> None:
+        """Write the plans in a block of messages."""
         for row, plan in enumerate(block.messages):
-            corners = plan["waypoints"][: plan["count"]]
+            way_points = plan["waypoints"][: plan["count"]]
             if plan["kind"] != SegmentKind.PATH or plan["error"]:
-                corners = corners[:0]
-            points = [tool_at(joints) for joints in corners]
-            lines = [[tool_at(joints) for joints in in_pieces(corners)]] if points else []
+                way_points = way_points[:0]
+            points = [tool_at(joints) for joints in way_points]
+            lines = [[tool_at(joints) for joints in in_pieces(way_points)]] if points else []
             when = block.visible(row)
             stream.at(when, PATH, rr.LineStrips3D(lines, radii=LINE_M, colors=[PLANNED]))
             stream.at(when, WAYPOINTS, rr.Points3D(points, radii=POINT_M, colors=[PLANNED]))
@@ -274,7 +282,7 @@ def planned_path(stream: Stream, cell: Cell) -> ViewPart:
 
 
 def in_pieces(corners: Array) -> Array:
-    """Return the points of a joint path, (points, joints), with no piece longer than `STEP_RAD`."""
+    """Subdivide a joint path, (points, joints), so that no piece is longer than `STEP_RAD`."""
     longest = np.abs(np.diff(corners, axis=0)).max(axis=1)
     counts = np.maximum(np.ceil(longest / STEP_RAD), 1)
     numbers = np.concatenate(([0], np.cumsum(counts)))  # of the corners, among all points
@@ -283,14 +291,12 @@ def in_pieces(corners: Array) -> Array:
 
 
 class Goals:
-    """Writes the places where a `TaskPlan` puts its objects down, and the goal of the current
-    move.
-    """
+    """Writes the places where a `TaskPlan` releases objects, and the goal of the current move."""
 
     def __init__(self, stream: Stream, objects: Sequence[str]) -> None:
         self._stream = stream
         self._objects = objects
-        self._goals: dict[int, tuple[list[float], str]] = {}  # place and label, by move
+        self._goals: dict[int, tuple[list[float], str]] = {}  # position and label, by move
         self._planned_rows = change_finder()
         self._current_rows = change_finder()
         for entity in (GOALS, CURRENT_GOAL):
@@ -328,8 +334,10 @@ class Goals:
             self._stream.at(block.when(row), CURRENT_GOAL, point)
 
     def _name(self, move: np.void) -> str:
+        """Return the label of a move: its verb and its object."""
         return f"{worded(Verb, int(move['verb']))} {self._object(move)}".strip()
 
     def _object(self, move: np.void) -> str:
+        """Return the name of a move's object, or "" if it has none."""
         row = int(move["object"])
         return self._objects[row] if 0 <= row < len(self._objects) else ""

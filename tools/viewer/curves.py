@@ -1,4 +1,4 @@
-"""Curves: the arm's joints against their set points and limits, and the numbers of any message."""
+"""Curves of the arm's joints with set points and limits, and of the numbers of any message."""
 
 from __future__ import annotations
 
@@ -25,27 +25,35 @@ from rack.tools.viewer.style import (
 
 SIGNALS = "signals"
 MAX_CURVES = 16
-"""Fields with more numbers than this are tables, not curves; they are in signals/."""
+"""Largest number of curves of a field. Fields with more numbers are only in signals/."""
 JOINTS = "joints"
 ERROR = "tracking_error"
 GRIPPER = "gripper"
 OPENING = "opening"
 GRIP = "force"
 QUANTITIES = {"position": "rad", "velocity": "rad/s", "torque": "N m"}
-"""Curves of a joint and their units; the torque is the one applied, after the limit gate."""
+"""Quantities of a joint, and their units. The torque is the applied one, after the limit gate."""
 FIELDS = {
     "position": {"commanded": "target", "measured": "position"},
     "velocity": {"commanded": "target_velocity", "measured": "velocity"},
     "torque": {"applied": "torque"},
 }
-"""Fields of the curves of a joint, by what they show."""
+"""Fields for the curves of a joint, by quantity and meaning."""
 
 
 def joint_curves(
     stream: Stream, names: Sequence[str], cell: Cell, has_gripper: bool
 ) -> Iterator[ViewPart]:
-    """Yield the parts that write the status of what drives the arm: each joint as measured and as
-    commanded, with its limits, tracking error and gripper.
+    """Yield the parts that show the status of the board that drives the arm.
+
+    They are curves of each joint as measured and commanded, with limits, tracking errors and the
+    gripper.
+
+    Args:
+        stream: Where they are written.
+        names: Names of the joints.
+        cell: Cell of the arm.
+        has_gripper: Whether the status contains the gripper.
     """
     colours = of_joints(len(names))
     write_legend(stream, JOINTS, names, colours)
@@ -55,17 +63,17 @@ def joint_curves(
         "velocity": np.column_stack((-bounds.velocity, bounds.velocity)),
         "torque": np.column_stack((-bounds.torque, bounds.torque)),
     }
-    for at, name in enumerate(names):
+    for index, name in enumerate(names):
         for quantity, fields in FIELDS.items():
             entity = (JOINTS, name, quantity)
-            yield _limits(stream, (*entity, "limits"), limits[quantity][at])
-            labels = [f"{name} {how}, {QUANTITIES[quantity]}" for how in fields]
-            values = partial(_of_joint, at, tuple(fields.values()))
+            yield _limits(stream, (*entity, "limits"), limits[quantity][index])
+            labels = [f"{name} {meaning}, {QUANTITIES[quantity]}" for meaning in fields]
+            values = partial(_of_joint, index, tuple(fields.values()))
             if len(fields) == 1:
-                yield curves(stream, entity, values, labels, [colours[at]])
+                yield curves(stream, entity, values, labels, [colours[index]])
             else:
-                both = [COMMANDED, colours[at]]
-                yield curves(stream, entity, values, labels, both, OVERLAID)
+                shades = [COMMANDED, colours[index]]
+                yield curves(stream, entity, values, labels, shades, OVERLAID)
     labels = [f"{name}, mrad" for name in names]
     yield curves(
         stream,
@@ -91,38 +99,42 @@ def joint_curves(
 
 
 def _limits(stream: Stream, entity: Sequence[str], limits: Array) -> ViewPart:
-    """Return the part that writes the limits of a quantity, (2,): straight lines need only their
-    ends.
+    """Return the part that writes two limits, (2,), at the first and last row of each block.
+
+    Straight lines need no other points.
     """
     style_curves(stream, entity, ["lower limit", "upper limit"], [LIMIT, LIMIT], [1.0, 1.0])
     return lambda block: stream.scalars(entity, block.times_of([0, -1]), np.tile(limits, (2, 1)))
 
 
-def _of_joint(at: int, fields: Sequence[str], block: RowBlock) -> Array:
-    return np.stack([block.messages[field][:, at] for field in fields], axis=-1)
+def _of_joint(joint: int, fields: Sequence[str], block: RowBlock) -> Array:
+    """Return fields of one joint as columns, (rows, fields)."""
+    return np.stack([block.messages[field][:, joint] for field in fields], axis=-1)
 
 
 def gripper_units(cell: Cell) -> tuple[str, str]:
-    """Return the units of the gripper's opening and of its force."""
+    """Return the units of the gripper's opening and force."""
     assert cell.gripper is not None, "there is a gripper"
     joint = cell.model.dof_jntid[cell.gripper.dof]
-    turns = cell.model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE
-    return ("mrad", "N m") if turns else ("mm", "N")
+    is_hinge = cell.model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE
+    return ("mrad", "N m") if is_hinge else ("mm", "N")
 
 
 def field_curves(stream: Stream, mailbox: MailboxSpec) -> Iterator[ViewPart]:
-    """Yield the parts that write the numeric fields of a mailbox: a user's own messages show
-    without any configuration.
+    """Yield the parts that show the numeric fields of a mailbox.
+
+    A user's own messages are shown without any configuration.
     """
     for field in mailbox.fields:
         if field.fields or field.kind[1] not in "iufb" or not 0 < prod(field.shape) <= MAX_CURVES:
             continue
         unit = "" if field.unit in ("", "1") else f", {field.unit}"
-        places = [f"[{at}]" for at in range(prod(field.shape))] if field.shape else [""]
+        places = [f"[{position}]" for position in range(prod(field.shape))] if field.shape else [""]
         names = [f"{mailbox.name}.{field.name}{place}{unit}" for place in places]
         entity = (SIGNALS, mailbox.name, field.name)
         yield curves(stream, entity, partial(_numbers, field.name), names)
 
 
 def _numbers(field: str, block: RowBlock) -> Array:
+    """Return a field as one column per number, (rows, numbers)."""
     return np.asarray(block.messages[field], float).reshape(len(block.rows), -1)

@@ -1,6 +1,6 @@
-"""Log lines: the rack's events, from its event log, and the recorder's own losses and load.
+"""Log lines and lanes of the rack's events, and the losses and load of the recorder.
 
-Each board also has a lane: the kind of its last event, until the next.
+The lane of a board shows the kind of its last event, until the next one.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from rack.tools.viewer.style import EVENT_COLOURS, LOST, style_curves, style_lan
 EVENTS = "events"
 RECORDER = "recorder"
 UNSHOWN = ("printed", "miss")
-"""Events without a lane: misses have their own."""
+"""Events without a lane in this view. Misses have a lane beside their board's level."""
 RACK = "rack"
 """Lane of events that belong to no board."""
 LEVELS = {
@@ -35,16 +35,18 @@ LEVELS = {
     "miss": "DEBUG",
     "printed": "DEBUG",
 }
-"""Log levels by kind of event; INFO for any other."""
+"""Log level by kind of event. Others are INFO."""
 
 
 class Events:
-    """Follows events.jsonl, which the launcher writes line by line."""
+    """Follows events.jsonl, which the launcher writes line by line.
+
+    It shows faults in the hierarchy too, and with `marks` also in 3D.
+    """
 
     def __init__(
         self, stream: Stream, path: Path, hierarchy: Hierarchy, marks: Marks | None
     ) -> None:
-        """Show faults in the hierarchy and, where there is an arm, in 3D by `marks`."""
         self._stream = stream
         self._path = path
         self._hierarchy = hierarchy
@@ -53,22 +55,23 @@ class Events:
         self._lanes: dict[str, str] = {}  # what each board's lane shows
 
     def advance(self) -> None:
-        """Write the events that were added."""
+        """Write the events that were added since the last call."""
         if not self._path.is_file() or self._path.stat().st_size == self._read:
             return
         with self._path.open("rb") as file:
             file.seek(self._read)
-            # A line still being written is read the next time.
+            # A line that is still being written is read the next time.
             lines = [line for line in file.read().splitlines(keepends=True) if line.endswith(b"\n")]
         self._read += sum(map(len, lines))
         for line in lines:
             event = read_line(line.decode())
-            # The last line, the outcome of the run, is no event. What the launch waited for, class
-            # by class on a slow machine, is no news to who sees the run.
+            # The last line is the outcome, not an event. Waits during the launch are no news to
+            # somebody who already sees the run.
             if "tick" in event and not (event["kind"] == "waiting" and event["tick"] < 0):
                 self._write(Event(**event))
 
     def _write(self, event: Event) -> None:
+        """Write an event to the log and to its lane. Faults and losses change other views, too."""
         board = event.board or RACK
         when = Moment(max(0, event.tick), self._stream.times.monotonic(event.time_ns))
         text = f"{event.kind}: {board}: {event.text}"
@@ -85,11 +88,12 @@ class Events:
             self._hierarchy.recover(when, board)
 
     def _show(self, when: Moment, board: str, event: Event) -> None:
+        """Write an event to the lane of its board."""
         if board not in self._lanes:
             style_lane(self._stream, (EVENTS, board), EVENT_COLOURS)
         state: str = event.kind
         if event.code == "ends":
-            # The end of a fault ends its own span only, not that of a later event.
+            # The end of a fault ends the span of that fault only, not the span of a later event.
             if self._lanes.get(board) != state:
                 return
             state = ""
@@ -98,14 +102,17 @@ class Events:
 
 
 def row_losses(stream: Stream) -> Callable[[int, Mapping[str, int]], None]:
-    """Return a function that writes, at a tick, how many rows by ring were overwritten before the
-    recorder took them; it logs every loss.
+    """Return a function that writes the number of lost rows at a tick, and logs every new loss.
+
+    It takes the tick, and the number of rows that were overwritten before the recorder took them,
+    by ring.
     """
     entity = (RECORDER, "rows_lost")
     style_curves(stream, entity, ["rows lost"], [LOST])
     logged = Counter[str]()
 
     def write(tick: int, lost: Mapping[str, int]) -> None:
+        """Write the total number of lost rows, and log the new losses."""
         nonlocal logged
         when = stream.times.moment_of(tick)
         counts = Counter(lost)
@@ -118,14 +125,16 @@ def row_losses(stream: Stream) -> Callable[[int, Mapping[str, int]], None]:
 
 
 def recorder_load(stream: Stream) -> Callable[[int], None]:
-    """Return a function that writes, at a tick, the load of this process, a recorder, since its
-    last call.
+    """Return a function that writes the recorder's processor load since its last call, at a tick.
+
+    It measures its own process, which must be the recorder.
     """
     entity = (RECORDER, "load")
     style_curves(stream, entity, ["recorder, % of a core"])
     last = time.process_time(), time.monotonic()
 
     def write(tick: int) -> None:
+        """Write the processor load since the last call."""
         nonlocal last
         now = time.process_time(), time.monotonic()
         cpu_s, wall_s = np.subtract(now, last)

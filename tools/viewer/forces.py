@@ -1,6 +1,4 @@
-"""Forces of contacts: an arrow at each place where they are sensed, and curves of what is wanted
-and exerted.
-"""
+"""Contact forces: an arrow at each sensed place, and curves of wanted and exerted forces."""
 
 from __future__ import annotations
 
@@ -22,35 +20,44 @@ ARROWS = ("cell", "forces")
 FORCES = "forces"
 TASK = "task_frame"
 CONTACT = "contact"
-"""Groups of curves: along the axes of a task frame, of the whole contact against its limits."""
+"""Groups of curves: along the axes of a task frame, and of the contact force against its limits."""
 CONTACT_UNITS = {"force": "N", "torque": "N m"}
 """Quantities of a contact, and their units."""
 ARROW_COLOUR = 0x00E6FFFF
 LONGEST_M = 1.0
 TOOL_SHAFT_M = 0.014
-"""Length of an arrow at the limit of the arm on contacts, and its radius: a small force must show
-beyond the tool."""
+"""Length of an arrow at the arm's limit on contacts, and its radius.
+
+The length makes small forces visible beyond the tool.
+"""
 TIP_M = 0.02
 TIP_SHAFT_M = 0.003
-"""Length of an arrow at a fingertip for 1 N, and its radius."""
+"""Length of an arrow at a fingertip per newton, and its radius."""
 AXES = dict(zip(AXIS_NAMES, UNITS, strict=True))
-"""Units, by axis of a task frame."""
+"""Unit of each axis of a task frame."""
 
 
 class ContactPlace(NamedTuple):
-    """A place where forces are sensed, and the frame in which its messages give them."""
+    """A place where forces are sensed.
+
+    Attributes:
+        name: Name of the place.
+        site: Site at which it is.
+        orientation_site: Site whose orientation the sensed vectors have, or None if they have the
+            world's.
+    """
 
     name: str
-    site: int  # where it is
-    turned: int | None  # site whose orientation the frame has; None: the world's
+    site: int
+    turned: int | None
 
     @property
     def frame(self) -> str:
-        """Name of the frame in the recording."""
+        """Name of the place's frame in the recording."""
         return f"contact/{self.name}"
 
     def pose(self, data: mujoco.MjData) -> tuple[Array, Array]:
-        """Return place, m, and quaternion in `data`."""
+        """Return position, m, and quaternion of the frame in `data`."""
         quaternion = np.array([1.0, 0.0, 0.0, 0.0])
         if self.turned is not None:
             mujoco.mju_mat2Quat(quaternion, data.site_xmat[self.turned])
@@ -58,8 +65,9 @@ class ContactPlace(NamedTuple):
 
 
 def contacts_of(cell: Cell) -> list[ContactPlace]:
-    """Return the places where a cell's forces are sensed: the tool on a wrist sensor, the tips of a
-    hand.
+    """Return the places where a cell's forces are sensed.
+
+    These are the tool on a wrist sensor, or the fingertips of a hand.
     """
     if cell.hand is not None:
         tips = zip(cell.hand.names, cell.hand.tips, strict=True)
@@ -68,8 +76,14 @@ def contacts_of(cell: Cell) -> list[ContactPlace]:
 
 
 def contact_arrows(stream: Stream, cell: Cell, field: str) -> ViewPart:
-    """Return the part that writes the forces of the surroundings on tool or fingertips as arrows,
-    one every 20 ms of simulated time; the numbers of `field` begin with three for each place.
+    """Return the part that shows the forces on the tool or on the fingertips as arrows.
+
+    An arrow is drawn every 20 ms of simulated time.
+
+    Args:
+        stream: Where it is written.
+        cell: The cell.
+        field: Field of the message with three numbers for each place, and perhaps more after them.
     """
     scale, shaft = TIP_M, TIP_SHAFT_M
     if cell.wrist is not None:
@@ -81,47 +95,53 @@ def contact_arrows(stream: Stream, cell: Cell, field: str) -> ViewPart:
     sampled_rows = row_sampler(stream.times.clock_ns)
 
     def write(block: RowBlock) -> None:
+        """Write the arrows of the rows that are drawn."""
         chosen = sampled_rows(block.ticks)
         if not len(chosen):
             return
         times = block.times_of(chosen)
         forces = block.messages[field][chosen].reshape(len(chosen), -1)
-        for at, place in enumerate(places):
-            vectors = scale * forces[:, 3 * at : 3 * at + 3]
+        for index, place in enumerate(places):
+            vectors = scale * forces[:, 3 * index : 3 * index + 3]
             stream.columns((*ARROWS, place.name), times, rr.Arrows3D.columns(vectors=vectors))
 
     return write
 
 
 def task_forces(stream: Stream) -> Iterator[ViewPart]:
-    """Yield the parts that write a `ForceStatus`: what the tool exerts along each axis of the task
-    frame, and what is wanted of it.
+    """Yield the parts that show a `ForceStatus` along the axes of the task frame.
+
+    Each axis has a curve of the wanted value and one of the value that the tool exerts.
     """
-    for at, (axis, unit) in enumerate(AXES.items()):
+    for index, (axis, unit) in enumerate(AXES.items()):
         names = [f"{axis} wanted, {unit}", f"{axis} exerted, {unit}"]
-        values = partial(_wanted_and_exerted, at)
-        shades = [COMMANDED, of_joint(at)]
+        values = partial(_wanted_and_exerted, index)
+        shades = [COMMANDED, of_joint(index)]
         yield curves(stream, (FORCES, TASK, axis), values, names, shades, OVERLAID)
 
 
-def _wanted_and_exerted(at: int, block: RowBlock) -> Array:
-    """Return both along one axis, (rows, 2); nothing is wanted on an axis of motion."""
+def _wanted_and_exerted(axis: int, block: RowBlock) -> Array:
+    """Return both values along an axis, (rows, 2). Nothing is wanted on an axis of motion."""
     selected, wanted, wrench = (
-        block.messages[field][:, at] for field in ("selected", "wanted", "wrench")
+        block.messages[field][:, axis] for field in ("selected", "wanted", "wrench")
     )
     return np.column_stack((np.where(selected == 1, wanted, np.nan), -wrench))
 
 
 def contact_forces(stream: Stream, most: tuple[float, float]) -> Iterator[ViewPart]:
-    """Yield the parts that write a `Wrench` as the size of force and torque, with the arm's
-    limits, `most`.
+    """Yield the parts that show force and torque of a `Wrench`.
+
+    Args:
+        stream: Where they are written.
+        most: The arm's limits on force, N, and torque, N m.
     """
-    for at, (what, unit) in enumerate(CONTACT_UNITS.items()):
-        names = [f"limit, {unit}", f"{what} of the contact, {unit}"]
-        values = partial(_limit_and_size, most[at], 3 * at)
-        yield curves(stream, (FORCES, CONTACT, what), values, names, [LIMIT, of_joint(0)])
+    for index, (quantity, unit) in enumerate(CONTACT_UNITS.items()):
+        names = [f"limit, {unit}", f"{quantity} of the contact, {unit}"]
+        values = partial(_limit_and_size, most[index], 3 * index)
+        yield curves(stream, (FORCES, CONTACT, quantity), values, names, [LIMIT, of_joint(0)])
 
 
 def _limit_and_size(limit: float, first: int, block: RowBlock) -> Array:
+    """Return a limit, and the magnitude of three numbers of a wrench from `first` on, (rows, 2)."""
     size = np.linalg.norm(block.messages["wrench"][:, first : first + 3], axis=1)
     return np.column_stack((np.full(len(size), limit), size))

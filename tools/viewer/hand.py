@@ -1,4 +1,4 @@
-"""A hand: joints, tensions and tip forces by finger, as curves."""
+"""Curves of a hand: joints, tensions and tip forces by finger."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ TIPS = (HAND, "tip_forces")
 
 
 def hand_curves(stream: Stream, names: Sequence[str], hand: Hand) -> Iterator[ViewPart]:
-    """Yield the parts that write a `HandStatus` of a hand with the joints `names`."""
+    """Yield the parts that show a `HandStatus` of a hand whose joints have these names."""
     colours = of_joints(len(hand.names))
     write_legend(stream, HAND, hand.names, colours)
-    for at, finger in enumerate(hand.names):
-        yield from _finger_curves(stream, names, finger, at, np.flatnonzero(hand.fingers[at]))
+    for index, finger in enumerate(hand.names):
+        yield from _finger_curves(stream, names, finger, index, np.flatnonzero(hand.fingers[index]))
     labels = [f"{finger}, N" for finger in hand.names]
     yield curves(
         stream, TIPS, lambda block: np.linalg.norm(block.messages["force"], axis=2), labels, colours
@@ -34,42 +34,49 @@ def hand_curves(stream: Stream, names: Sequence[str], hand: Hand) -> Iterator[Vi
 
 
 def _finger_curves(
-    stream: Stream, names: Sequence[str], finger: str, at: int, joints: Ints
+    stream: Stream, names: Sequence[str], finger: str, finger_index: int, joints: Ints
 ) -> Iterator[ViewPart]:
-    """Yield the parts for a finger's joints, its tensions as sensed and as commanded, and the force
-    on its tip.
+    """Yield the parts that show one finger: joints, sensed and commanded tensions, and tip force.
+
+    Args:
+        stream: Where they are written.
+        names: Names of all joints of the hand.
+        finger: Name of the finger.
+        finger_index: Index of the finger.
+        joints: Indices of its joints.
     """
-    own = [names[joint] for joint in joints]
-    colours = of_joints(len(own))
+    joint_names = [names[joint] for joint in joints]
+    colours = of_joints(len(joint_names))
     yield curves(
         stream,
         (HAND, finger, JOINTS),
         lambda block: block.messages["position"][:, joints],
-        [f"{name}, rad" for name in own],
+        [f"{name}, rad" for name in joint_names],
         colours,
     )
 
-    def tensions(block: RowBlock) -> np.ndarray:
-        found = [
+    def stack_tensions(block: RowBlock) -> np.ndarray:
+        """Return commanded, then sensed tensions of the finger, each flexors first."""
+        columns = [
             block.messages[field][:, row][:, joints]
             for field in ("wanted", "tension")
             for row in (FLEXOR, EXTENSOR)
         ]
-        return np.hstack(found)
+        return np.hstack(columns)
 
-    tendons = [f"{name} {row}" for row in ("flexor", "extensor") for name in own]
+    tendons = [f"{name} {row}" for row in ("flexor", "extensor") for name in joint_names]
     yield curves(
         stream,
         (HAND, finger, TENSIONS),
-        tensions,
-        [f"{tendon}{what}, N" for what in (" commanded", "") for tendon in tendons],
+        stack_tensions,
+        [f"{tendon}{suffix}, N" for suffix in (" commanded", "") for tendon in tendons],
         [COMMANDED] * len(tendons) + colours + [dimmed(colour) for colour in colours],
         np.repeat(OVERLAID, len(tendons)).tolist(),
     )
     yield curves(
         stream,
         (HAND, finger, FORCES),
-        lambda block: block.messages["force"][:, at],
+        lambda block: block.messages["force"][:, finger_index],
         [f"{axis}, N" for axis in "xyz"],
         of_joints(3),
     )

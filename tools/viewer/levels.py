@@ -1,6 +1,4 @@
-"""The levels: state, command and move of each as lanes, errors as log lines, and all of them as a
-graph.
-"""
+"""The levels in the view: lanes for states and moves, log lines for errors, and a graph."""
 
 from __future__ import annotations
 
@@ -25,9 +23,9 @@ LEVELS = "levels"
 HIERARCHY = "hierarchy"
 ROW = 45.0
 COLUMN = 110.0
-"""Distance between nodes, in the graph's units; a letter is about 7 wide."""
+"""Distance between nodes, in the graph's units. A letter is about 7 units wide."""
 WIDEST = 3
-"""Boards of one level in a row: more would make the graph too small to read."""
+"""Number of boards per row of the graph, so that it stays large enough to read."""
 FIRED = ["table", "row", "fired", "in_state"]
 """Fields of a status that say which row of a state table fires."""
 
@@ -35,18 +33,18 @@ FIRED = ["table", "row", "fired", "in_state"]
 def value_lane(
     stream: Stream, lane: tuple[str, str], fields: str | list[str], name: Callable[[Any], str]
 ) -> ViewPart:
-    """Return the part that writes a value of a level's messages as a lane: its name, from where it
-    changes.
+    """Return the part that shows a value of a level's messages as a lane of names.
 
     Args:
         stream: Where it is written.
-        lane: The board, and what its lane shows.
-        fields: The field with the value; of several, the value is their tuple.
+        lane: The board, and the name of the lane.
+        fields: The field with the value. Several fields give a tuple.
         name: Returns the name of a value.
     """
     changed_rows = change_finder()
 
     def write(block: RowBlock) -> None:
+        """Write the name of the value wherever it changes."""
         values = block.messages[fields]
         rows = changed_rows(values)
         if len(rows):
@@ -57,27 +55,27 @@ def value_lane(
 
 
 def numbered(serial: int) -> str:
-    """Return the number of a command, or of a motion request; empty without one."""
+    """Format the number of a command or motion request. Empty for 0, which means none."""
     return str(serial) if serial else ""
 
 
 def step_name(step: tuple[int, int]) -> str:
-    """Return a step of a grasp, which is the count of those before it and its kind."""
+    """Format a step of a grasp, given the number of steps before it and its kind."""
     return f"{step[0] + 1} {worded(GraspKind, step[1])}"
 
 
 def move_name(move: tuple[int, int]) -> str:
-    """Return the verb of a move, which is its serial and its verb; empty without one."""
+    """Format the verb of a move, given its serial and verb. Empty without a move, serial 0."""
     return worded(Verb, move[1]) if move[0] else ""
 
 
 def worded(kind: type[IntEnum], number: int) -> str:
-    """Return a number that stands for a name in words: a state, a verb, a mode."""
+    """Return the name of an enum's number in words."""
     return kind(number).name.lower().replace("_", " ")
 
 
 def activity(stream: Stream, mailbox: MailboxSpec) -> Iterator[ViewPart]:
-    """Yield the parts that write the state in a level's statuses, and each error once."""
+    """Yield the parts that show a level's state as a lane, and each of its errors as a log line."""
     board, _, port = mailbox.name.partition(".")
     # An adapter also writes the statuses of other racks' levels.
     lane = board, "state" if port == "status" else port
@@ -86,6 +84,7 @@ def activity(stream: Stream, mailbox: MailboxSpec) -> Iterator[ViewPart]:
     changed_rows = change_finder()
 
     def write_errors(block: RowBlock) -> None:
+        """Write a log line for each new error."""
         messages = block.messages
         for row in changed_rows(messages["error"]):
             if error := messages["error"][row]:
@@ -97,21 +96,22 @@ def activity(stream: Stream, mailbox: MailboxSpec) -> Iterator[ViewPart]:
 
 
 def fired_rows(stream: Stream, mailbox: MailboxSpec) -> ViewPart:
-    """Return the part that writes which row of a state table fires, as a lane, and every change to
-    the log.
-    """
+    """Return the part that shows which row of a state table fires, as a lane and as log lines."""
     board = mailbox.name.partition(".")[0]
     changed_rows = change_finder()
 
     def write(block: RowBlock) -> None:
+        """Write every change of the fired row to the lane and to the log."""
         changed = changed_rows(block.messages[FIRED])
         names = []
-        for at in changed:
-            table, row, fired, state = block.messages[FIRED][at]
+        for row_index in changed:
+            table, row, fired, state = block.messages[FIRED][row_index]
             names.append(f"{row} {text_of(fired)}")
             now = f"now in '{text_of(state)}', table {text_of(table)}"
             text = f"row {row} '{text_of(fired)}', {now}"
-            stream.say(block.when(at), "rows", f"{board}: {text}", "INFO" if row else "ERROR")
+            stream.say(
+                block.when(row_index), "rows", f"{board}: {text}", "INFO" if row else "ERROR"
+            )
         if names:
             write_spans(stream, (LEVELS, board, "row"), block.times_of(changed), names)
 
@@ -119,17 +119,17 @@ def fired_rows(stream: Stream, mailbox: MailboxSpec) -> ViewPart:
 
 
 class Hierarchy:
-    """Writes the tasks as nodes of a graph, coloured by state, whenever a state changes.
+    """Writes the tasks as nodes of a graph, coloured by state.
 
-    Levels are above each other, other boards to the left. Edges go down the levels, and from
-    planners with plans.
+    Levels are above each other, and other boards to their left. Edges lead down the levels, and
+    from planners to their boards.
     """
 
     def __init__(self, stream: Stream, layout: Layout, rack: RackTiming) -> None:
         self._stream = stream
         self._tasks = [task.name for task in layout.tasks]
-        self._states = dict.fromkeys(self._tasks, "idle")  # the newest ones
-        self._shown = dict(self._states)  # those that the graph shows
+        self._states = dict.fromkeys(self._tasks, "idle")  # the newest states
+        self._shown = dict(self._states)  # the states that the graph shows
         self._positions = positions(layout, rack)
         self._changes: list[tuple[Moment, str, str]] = []
         downward = [(board.name, below) for board in rack.boards.values() for below in board.below]
@@ -138,34 +138,36 @@ class Hierarchy:
         self._log(stream.times.moment_of(0))
 
     def write(self, task: str, block: RowBlock) -> None:
-        """Note where a task's state changes."""
+        """Note the changes of a task's state."""
         names = _names(block.rows)
         before = np.concatenate(([self._states[task]], names[:-1]))
         for row in np.flatnonzero(names != before):
             self._note(block.when(row), task, str(names[row]))
 
     def lose(self, when: Moment, board: str) -> None:
-        """Note that a board died or does not respond."""
+        """Note that a board died or stopped responding."""
         if board in self._states:
             self._note(when, board, "lost")
 
     def recover(self, when: Moment, board: str) -> None:
-        """Note that a lost board is back; its state follows from its cycles."""
+        """Note that a lost board is back. Its state follows from its next cycles."""
         if self._states.get(board) == "lost":
             self._note(when, board, "idle")
 
     def _note(self, when: Moment, task: str, state: str) -> None:
+        """Add a change of state, to be written by `write_changes`."""
         self._changes.append((when, task, state))
         self._states[task] = state
 
     def advance(self) -> None:
-        """Write what was noted, in the order of time."""
+        """Write the noted changes in the order of time."""
         for when, task, state in sorted(self._changes):
             self._shown[task] = state
             self._log(when)
         self._changes.clear()
 
     def _log(self, when: Moment) -> None:
+        """Write the graph with the current colours."""
         nodes = rr.GraphNodes(
             self._tasks,
             positions=[self._positions[task] for task in self._tasks],
@@ -179,23 +181,23 @@ class Hierarchy:
 def _names(rows: np.ndarray) -> np.ndarray:
     """Return the state of the level in each trace record, or "missed"."""
     names = np.array([state.name.lower() for state in State] + ["missed"])
-    shown = np.where(is_missed(rows), len(names) - 1, rows["state"])
-    return np.asarray(names[shown])
+    indices = np.where(is_missed(rows), len(names) - 1, rows["state"])
+    return np.asarray(names[indices])
 
 
 def positions(layout: Layout, rack: RackTiming) -> dict[str, tuple[float, float]]:
-    """Return the places of the tasks: levels in rows, their planners to the right, other boards to
-    the left.
+    """Return the positions of the tasks in the graph.
 
-    Boards of the same level are next to each other, in several rows if they are many.
+    Each rank of levels is a row, or several if it has many boards. Planners are to the right of
+    their boards, and boards outside the hierarchy to the left.
     """
     placed: dict[str, tuple[int, int]] = {}
-    first = 0
+    next_row = 0
     for boards in rack.ranks:
         step = 1 + any(rack.boards[board].has_planner for board in boards)
-        for at, board in enumerate(boards):
-            placed[board] = at % WIDEST * step, first + at // WIDEST
-        first += -(-len(boards) // WIDEST)
+        for index, board in enumerate(boards):
+            placed[board] = index % WIDEST * step, next_row + index // WIDEST
+        next_row += -(-len(boards) // WIDEST)
     others = [t.board for t in layout.tasks if t.role == "executor" and t.board not in placed]
     placed |= {board: (-1, row) for row, board in enumerate(others)}
     return {

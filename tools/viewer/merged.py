@@ -1,6 +1,4 @@
-"""Recorded runs of several racks as one recording for the viewer: each below its name, all on one
-time line.
-"""
+"""Recorded runs of several racks as one recording for the viewer, on one time line."""
 
 from __future__ import annotations
 
@@ -16,12 +14,21 @@ from rack.tools.viewer.sink import RackWriter, Ran, block_of
 from rack.tools.viewer.stream import Moment, Stream, Timelines, new_recording
 
 
-def write_merged(placed: Sequence[RackPlace], file: Path, show: Callable[[float], None]) -> None:
-    """Write one recording of all these racks; `show` gets the part that is done, 0 to 1.
+def write_merged(
+    placed: Sequence[RackPlace], file: Path, show_progress: Callable[[float], None]
+) -> None:
+    """Write one recording that shows all of these racks, each under its name.
 
-    The notes on the times of racks are in its log. Of a single rack it is that rack's run.rrd.
-    Raises `Failure` for a recording that cannot be read, and `RuntimeError` when the file cannot be
-    written.
+    The notes on the times of the racks go to its log. A single rack's recording equals its run.rrd.
+
+    Args:
+        placed: The racks and their places on the time line.
+        file: File to write.
+        show_progress: Called with the completed fraction, 0 to 1.
+
+    Raises:
+        Failure: A recording cannot be read.
+        RuntimeError: The file cannot be written.
     """
     ran = {}
     roots: dict[str, tuple[str, ...]] = {}
@@ -45,36 +52,43 @@ def write_merged(placed: Sequence[RackPlace], file: Path, show: Callable[[float]
         for tick, text in place.marks:
             stamp_ns = int(first.stamp_ns(np.array([tick]))[0])
             log.say(Moment(tick, stamp_ns), "time line", text, "INFO")
-    for at, place in enumerate(placed):
-        own = place.own
-        stream = Stream(recording, Timelines(own.clock_ns, own.launch, place), roots[own.rack])
-        writer = RackWriter(stream, ran[own.rack])
-        last = own.ticks[1] + 1
-        if kept := own.recording.kept_text:
-            stream.say(Moment(0, own.epoch_ns), "recorder", f"recorder: {kept}", "WARN")
-        for tick, taken in _blocks(own.recording, last, block_of(own.recording.layout)):
-            if kept and not taken:
+    for index, place in enumerate(placed):
+        grid = place.own
+        stream = Stream(recording, Timelines(grid.clock_ns, grid.launch, place), roots[grid.rack])
+        writer = RackWriter(stream, ran[grid.rack])
+        last = grid.ticks[1] + 1
+        if kept_text := grid.recording.kept_text:
+            stream.say(Moment(0, grid.epoch_ns), "recorder", f"recorder: {kept_text}", "WARN")
+        for tick, rows in _blocks(grid.recording, last, block_of(grid.recording.layout)):
+            if kept_text and not rows:
                 writer.skip(tick)
                 continue
-            lost = own.recording.lost if tick == last else {}
-            writer.write(taken, tick, lost)
+            lost = grid.recording.lost if tick == last else {}
+            writer.write(rows, tick, lost)
             stream.flush()
-            show((at + tick / last) / len(placed))
+            show_progress((index + tick / last) / len(placed))
     recording.disconnect()
 
 
 def _blocks(
     recording: Recording, last: int, block: int
 ) -> Iterator[tuple[int, Mapping[str, np.ndarray]]]:
-    """Yield the rows of all rings, by ring, up to a tick, and that tick, block by block."""
+    """Yield the rows of all rings in blocks: the tick at which a block ends, and rows by ring.
+
+    Args:
+        recording: The recording.
+        last: Tick after the last one.
+        block: Ticks in a block.
+    """
     layout = recording.layout
     names = [*(task.name for task in layout.tasks), *(box.name for box in layout.timed)]
     recorded = {*recording.cycles, *recording.mailboxes}
     rings = {name: recording.rows(name) for name in names if name in recorded}
     borders = list(range(block, last, block))
-    # The last block has all that is left: what clock and operator wrote after the last cycle, too.
+    # The last block contains all remaining rows, including messages that the clock and operators
+    # wrote after the last cycle.
     pieces = {
         name: np.split(rows, np.searchsorted(rows["tick"], borders)) for name, rows in rings.items()
     }
-    for at, tick in enumerate((*borders, last)):
-        yield tick, {name: rows[at] for name, rows in pieces.items() if len(rows[at])}
+    for index, tick in enumerate((*borders, last)):
+        yield tick, {name: rows[index] for name, rows in pieces.items() if len(rows[index])}

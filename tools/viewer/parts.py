@@ -1,4 +1,4 @@
-"""The viewer's files of a run: run.rrd, and of a long one the parts that continue it."""
+"""The viewer's files of a run: run.rrd, and the parts that continue it in a long run."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ FILE = "run.rrd"
 
 
 def names(file: Path) -> Iterator[Path]:
-    """Yield the names of a file and its parts: run.rrd, run-2.rrd and so on, without an end."""
+    """Yield the names of a file and of its parts without end: run.rrd, run-2.rrd and so on."""
     yield file
     for part in count(2):
         yield file.with_stem(f"{file.stem}-{part}")
 
 
 def next_file(folder: Path) -> Path:
-    """Return the file to write; a restarted recorder overwrites none."""
+    """Return the next unused file name, so that a restarted recorder overwrites nothing."""
     return next(path for path in names(folder / FILE) if not path.is_file())
 
 
 def parts_of(file: Path) -> list[Path]:
-    """Return the parts that there are, oldest first."""
+    """Return the existing parts of a recording, oldest first."""
     return [*takewhile(Path.is_file, names(file))]

@@ -1,5 +1,6 @@
-"""Pictures of a recording without a screen: `python -m rack.tools.viewer.pictures RUN/run.rrd
-OUT.png --at 7.5`.
+"""Pictures of a recording, drawn without a screen.
+
+Usage: `python -m rack.tools.viewer.pictures RUN/run.rrd OUT.png --at 7.5`.
 """
 
 from __future__ import annotations
@@ -25,12 +26,12 @@ from rack.tools.viewer.window import HOST, ViewerWindow, free_port, url
 PATIENCE_S = 30.0
 LOOK_S = 0.05
 DYING_S = 2.0
-"""A viewer without a graphics driver listens at first, then ends."""
+"""Time to wait for the end of a viewer. Without a graphics driver it listens first, then ends."""
 PAUSE_S = 0.4
-"""When two pictures this far apart are equal, the viewer has drawn everything."""
+"""Time between two pictures. If they are equal, the viewer has drawn everything."""
 QUIET_LEVELS = ("INFO", "DEBUG", "TRACE")
 SOFTWARE = "Software rasterizer"
-"""The viewer's remark where there is no graphics card; it draws all the same."""
+"""Remark of the viewer on a machine without a graphics card, which does not affect drawing."""
 PACKAGES = (
     "mesa-vulkan-drivers",
     "libvulkan1",
@@ -43,38 +44,47 @@ PACKAGES = (
     "libxi6",
     "libxrandr2",
 )
-"""Debian's packages for drawing without a graphics card; .ci/run installs them."""
+"""Debian packages for drawing without a graphics card; .ci/run installs them."""
 
 
 class NoViewerError(Failure):
-    """This machine cannot draw pictures; the message says why, and what to install."""
+    """This machine cannot draw pictures. The message says why, and what to install."""
 
 
 class Look(NamedTuple):
-    """A picture (PNG), and the complaints of the viewer in its views and its log."""
+    """A picture as PNG, and the complaints of the viewer.
+
+    Attributes:
+        picture: The picture.
+        complaints: Reports of its views and warnings in its log.
+    """
 
     picture: bytes
     complaints: tuple[str, ...]
 
 
 class Screen:
-    """A headless viewer that shows one recording; see `opened`."""
+    """A headless viewer that shows one recording. Created by `open_screen`."""
 
     def __init__(self, client: ViewerClient) -> None:
         self._client = client
 
     @property
     def views(self) -> dict[str, str]:
-        """The views that are open, by name, and their ids."""
+        """Ids of the open views, by name."""
         return {view.name: view.view_id for view in self._client.get_state().views}
 
     def look(self, at_s: float, view: str | None = None) -> Look:
-        """Return the picture at a simulated time, s, once it no longer changes: all views, or the
-        one of that name.
+        """Return the picture at a simulated time, once it no longer changes.
 
-        Raises `KeyError` when there is no such view.
+        Args:
+            at_s: Simulated time, s.
+            view: Name of the only view to draw. Defaults to all views.
+
+        Raises:
+            KeyError: No view has that name.
         """
-        shown = None if view is None else self.views[view]
+        view_id = None if view is None else self.views[view]
         self._client.set_time(
             SIM_TIME, duration=np.timedelta64(round(at_s * 1e9), "ns"), play_state="paused"
         )
@@ -83,12 +93,13 @@ class Screen:
         while time.monotonic() < deadline:
             time.sleep(PAUSE_S)
             before = drawn
-            drawn = bytes(self._client.take_screenshot(shown))
+            drawn = bytes(self._client.take_screenshot(view_id))
             if drawn == before:
                 break
         return Look(drawn, tuple(self._complaints()))
 
     def _complaints(self) -> Iterator[str]:
+        """Yield the reports of all views, and the viewer's log above the level of information."""
         for view in self._client.get_state().views:
             yield from (f"view '{view.name}': {report}" for report in view.reports)
         for entry in self._client.get_logs():
@@ -98,11 +109,13 @@ class Screen:
 
 @contextmanager
 def opened(recording: Path) -> Iterator[Screen]:
-    """Open a recording in a headless viewer. Raises `NoViewerError` where the machine lacks the
-    graphics libraries.
+    """Open a recording in a headless viewer.
+
+    Raises:
+        NoViewerError: The machine lacks the graphics libraries.
     """
     port = free_port()
-    # Not by `ViewerClient.spawn`: that viewer would listen on every network.
+    # `ViewerClient.spawn` would start a viewer that listens on every network.
     window = ViewerWindow(headless=True, port=port)
     try:
         client = _connected(window, port)
@@ -116,17 +129,18 @@ def opened(recording: Path) -> Iterator[Screen]:
 
 
 def _connected(window: ViewerWindow, port: int) -> ViewerClient:
+    """Connect to a viewer as soon as it listens. Raises `NoViewerError` if it never does."""
     deadline = time.monotonic() + PATIENCE_S
     while window.is_open and time.monotonic() < deadline:
         with socket.socket() as probe:
             if probe.connect_ex((HOST, port)) == 0:
                 return ViewerClient.connect(url(port))
         time.sleep(LOOK_S)
-    raise NoViewerError(_why(window, f"it does not listen after {PATIENCE_S:g} s"))
+    raise NoViewerError(_why(window, f"the viewer did not listen within {PATIENCE_S:g} s"))
 
 
 def _why(window: ViewerWindow, otherwise: object) -> str:
-    """Return why there is no picture, and what to install."""
+    """Return the reason why there is no picture, and what to install."""
     reason = window.wait() if window.ends_within(DYING_S) else otherwise
     return f"{reason}; {packages_text()}"
 
@@ -134,17 +148,17 @@ def _why(window: ViewerWindow, otherwise: object) -> str:
 def packages_text() -> str:
     """Return which packages for drawing without a graphics card are missing."""
     if shutil.which("dpkg-query") is None:
-        return f"a machine without a graphics card needs what Debian calls {' '.join(PACKAGES)}"
-    asked = ["dpkg-query", "--show", "--showformat", "${Package} ${Status}\\n", *PACKAGES]
-    found = subprocess.run(asked, capture_output=True, text=True, check=False).stdout
-    missing = [name for name in PACKAGES if f"{name} install ok installed" not in found]
+        return f"without a graphics card, these Debian packages are needed: {' '.join(PACKAGES)}"
+    query = ["dpkg-query", "--show", "--showformat", "${Package} ${Status}\\n", *PACKAGES]
+    installed = subprocess.run(query, capture_output=True, text=True, check=False).stdout
+    missing = [name for name in PACKAGES if f"{name} install ok installed" not in installed]
     if not missing:
-        return "no package for it is missing"
+        return "no package for drawing is missing"
     return f"missing packages: apt-get install {' '.join(missing)}"
 
 
 def main() -> int:
-    """Save one picture; return 1 if the viewer complained of anything."""
+    """Save one picture. Returns 1 if the viewer complained."""
     parser = argparse.ArgumentParser(
         prog="python -m rack.tools.viewer.pictures", description=__doc__
     )
@@ -153,15 +167,15 @@ def main() -> int:
     parser.add_argument(
         "--at", type=float, required=True, metavar="S", help="simulated time to look at, s"
     )
-    parser.add_argument("--view", metavar="NAME", help="one view alone, as its title says")
-    given = parser.parse_args()
+    parser.add_argument("--view", metavar="NAME", help="draw only the view with this title")
+    options = parser.parse_args()
     try:
-        with opened(given.recording) as screen:
-            look = screen.look(given.at, given.view)
+        with opened(options.recording) as screen:
+            look = screen.look(options.at, options.view)
     except Failure as failure:
         print(failure, file=sys.stderr)
         return failure.status
-    given.out.write_bytes(look.picture)
+    options.out.write_bytes(look.picture)
     for complaint in look.complaints:
         print(complaint, file=sys.stderr)
     return 1 if look.complaints else 0

@@ -1,4 +1,4 @@
-"""Reading a recording back: curves and spans of run.rrd as arrays."""
+"""Reads curves and spans of run.rrd as arrays."""
 
 from __future__ import annotations
 
@@ -13,8 +13,11 @@ from rack.tools.viewer.stream import TICK
 
 
 class Rows(NamedTuple):
-    """Rows of one entity in the order of ticks: `ticks` (rows,), `values` one list or array a
-    row.
+    """Rows of one entity in the order of ticks.
+
+    Attributes:
+        ticks: Tick of each row, shape (rows,).
+        values: One list or array per row.
     """
 
     ticks: np.ndarray
@@ -22,8 +25,15 @@ class Rows(NamedTuple):
 
 
 def read(file: Path, entity: str, component: str = "Scalars:scalars") -> Rows:
-    """Return one component of an entity, from a file and the parts that continue it; curves are
-    (rows, curves). Raises `KeyError` when they have none.
+    """Read one component of an entity, from a file and the parts that continue it.
+
+    Args:
+        file: The first file of the recording.
+        entity: Path of the entity.
+        component: The component. Defaults to curves, whose values have shape (rows, curves).
+
+    Raises:
+        KeyError: The files contain no such component.
     """
     chunks = [
         chunk

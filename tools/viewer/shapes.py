@@ -1,4 +1,4 @@
-"""One MuJoCo geom as a shape in the frame of its body."""
+"""Shapes of MuJoCo geoms, in the frame of their body."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Geom = mujoco.mjtGeom
 
 
 def shape_of(model: mujoco.MjModel, geom: int) -> rr.AsComponents | None:
-    """Return the shape of a geom; None for one that is invisible."""
+    """Return the shape of a geom, or None if it is invisible."""
     rgba = colour(model, geom)
     if rgba[3] == 0:
         return None
@@ -37,7 +37,7 @@ def shape_of(model: mujoco.MjModel, geom: int) -> rr.AsComponents | None:
         case Geom.mjGEOM_CYLINDER:
             return rr.Cylinders3D(lengths=[2 * half], radii=[radius], **centred)
         case Geom.mjGEOM_CAPSULE:
-            # MuJoCo's capsule is centred; rerun's begins at its origin.
+            # MuJoCo's capsule is centred on its origin; rerun's begins at its origin.
             begin = placed(model, geom, np.array([[0.0, 0.0, -half]]))
             return rr.Capsules3D(lengths=[2 * half], radii=[radius], translations=begin, **solid)
         case Geom.mjGEOM_PLANE:
@@ -50,25 +50,27 @@ def shape_of(model: mujoco.MjModel, geom: int) -> rr.AsComponents | None:
 
 
 def colour(model: mujoco.MjModel, geom: int) -> NDArray[np.uint8]:
-    """Return red, green, blue, alpha of a geom, 0 to 255: its material's, where it has one."""
+    """Return red, green, blue and alpha of a geom or of its material, 0 to 255."""
     material = model.geom_matid[geom]
     rgba = model.geom_rgba[geom] if material < 0 else model.mat_rgba[material]
     return np.asarray(np.round(rgba * 255), dtype=np.uint8)
 
 
 def xyzw(quaternions: Array) -> Array:
-    """Return MuJoCo's quaternions, w first, as rerun's, w last; shape (..., 4)."""
+    """Convert MuJoCo's quaternions, w first, to rerun's, w last; shape (..., 4)."""
     return np.roll(quaternions, -1, axis=-1)
 
 
 def _plane(model: mujoco.MjModel, geom: int) -> rr.AsComponents:
-    # A half size of zero is an endless plane: as large as what stands on it.
-    x, y = (size or 2 * model.stat.extent for size in model.geom_size[geom][:2])
+    """Return a plane as two triangles."""
+    # A half size of zero means an infinite plane, which is drawn larger than the model.
+    x, y = (half_size or 2 * model.stat.extent for half_size in model.geom_size[geom][:2])
     corners = np.array([[-x, -y, 0.0], [x, -y, 0.0], [x, y, 0.0], [-x, y, 0.0]])
     return _surface(model, geom, corners, np.array([[0, 1, 2], [0, 2, 3]]))
 
 
 def _mesh(model: mujoco.MjModel, geom: int) -> rr.AsComponents:
+    """Return a mesh or signed distance field as triangles."""
     mesh = model.geom_dataid[geom]
     vertices = slice(model.mesh_vertadr[mesh], model.mesh_vertadr[mesh] + model.mesh_vertnum[mesh])
     faces = slice(model.mesh_faceadr[mesh], model.mesh_faceadr[mesh] + model.mesh_facenum[mesh])
@@ -76,6 +78,7 @@ def _mesh(model: mujoco.MjModel, geom: int) -> rr.AsComponents:
 
 
 def _height_field(model: mujoco.MjModel, geom: int) -> rr.AsComponents:
+    """Return a height field as triangles."""
     field = model.geom_dataid[geom]
     rows = model.hfield_nrow[field]
     columns = model.hfield_ncol[field]
@@ -91,7 +94,15 @@ def _height_field(model: mujoco.MjModel, geom: int) -> rr.AsComponents:
 def _surface(
     model: mujoco.MjModel, geom: int, vertices: Array, triangles: NDArray[np.integer]
 ) -> rr.AsComponents:
-    # Flat shading: every triangle has corners of its own, so that an edge stays an edge.
+    """Return triangles as a mesh with flat shading.
+
+    Args:
+        model: The model.
+        geom: The geom, which gives pose and colour.
+        vertices: Vertices in the frame of the geom, shape (n, 3), m.
+        triangles: Indices of the vertices, shape (triangles, 3).
+    """
+    # Flat shading: triangles share no corners, so that edges stay sharp.
     corners = placed(model, geom, vertices)[triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normals, axis=1, keepdims=True)
@@ -105,7 +116,7 @@ def _surface(
 
 
 def placed(model: mujoco.MjModel, geom: int, points: Array) -> Array:
-    """Return points of a geom's frame in the frame of its body, (points, 3), m."""
+    """Transform points from the frame of a geom to the frame of its body, shape (points, 3), m."""
     rotation = np.zeros(9)
     mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
     return np.asarray(model.geom_pos[geom] + points @ rotation.reshape(3, 3).T)

@@ -1,6 +1,4 @@
-"""The recorder's rows as a recording for the viewer: taken as they are drained, written in
-blocks.
-"""
+"""Writes the recorder's rows as a recording for the viewer, in blocks."""
 
 from __future__ import annotations
 
@@ -64,7 +62,7 @@ from rack.tools.viewer.timing import (
 
 SHOWN_OTHERWISE = (ArmState, Scene, WorldState, JointTorque, JointStatus, HandStatus)
 UNCURVED = {*DRIVING, *(message.message_type.name for message in SHOWN_OTHERWISE)}
-"""Messages whose fields are not shown as curves, one by one."""
+"""Message types whose fields are not shown as separate curves."""
 LANES: tuple[tuple[type[Message], str, str | list[str], Callable[[Any], str]], ...] = (
     (MoveStatus, "move", ["current", "verb"], move_name),
     (MotionStatus, "request", "current", numbered),
@@ -72,19 +70,27 @@ LANES: tuple[tuple[type[Message], str, str | list[str], Callable[[Any], str]], .
     (GraspStatus, "step", ["step", "kind"], step_name),
     (ServerStatus, "mode", "mode", partial(worded, Mode)),
 )
-"""Lanes of messages: what each shows, of which fields, and how its values are named."""
+"""Lanes of messages: message class, name of the lane, its fields, and the names of their values."""
 BLOCK_S = 1.0
-"""Simulated time in one block: a call costs the same for 4 rows as for 400."""
+"""Simulated time in a block. Writing costs the same for 4 rows as for 400."""
 
 
 PART_S = 180.0
-"""Simulated time in one file. Until a file is finished, its index is in memory: 0.65 MB a second of
-the NASREM rack."""
+"""Simulated time in a file.
+
+Until a file is finished, its index is in memory, which takes 0.65 MB per second of the NASREM rack.
+"""
 
 
 class Ran(NamedTuple):
-    """What a view needs to know of a rack before its first row: its layout, its config, its cell,
-    its event log.
+    """Everything that the view needs to know of a run before its first row.
+
+    Attributes:
+        layout: Layout of the rack.
+        text: The resolved config as text.
+        config: The config.
+        cell: Cell of the arm, or None without an arm.
+        events: Path of the event log.
     """
 
     layout: Layout
@@ -95,7 +101,7 @@ class Ran(NamedTuple):
 
     @classmethod
     def of(cls, layout: Layout, text: str, folder: Path) -> Self:
-        """Return it for a run in `folder`; `text` is the resolved config."""
+        """Build the context of a run in `folder`, whose resolved config is `text`."""
         config = read_stored(text)
         robot = config.robot
         cell = None if robot is None else build_cell(robot, config.scene, config.clock_ns)
@@ -103,14 +109,14 @@ class Ran(NamedTuple):
 
 
 class RackWriter:
-    """Writes what one rack left in its rings to a stream, in blocks."""
+    """Writes the rows of a rack's rings to a stream, in blocks."""
 
     def __init__(self, stream: Stream, ran: Ran) -> None:
         layout = ran.layout
         config = ran.config
         self._times = stream.times
         write_document(stream, ran.text, config, layout)
-        of_mailbox: dict[str, list[ViewPart]] = {
+        parts_by_mailbox: dict[str, list[ViewPart]] = {
             box.name: list(_of_any(stream, box)) for box in layout.mailboxes
         }
         marks = None
@@ -121,15 +127,16 @@ class RackWriter:
             marks = Marks(stream, ran.cell, config.robot.joints)
             for box in layout.mailboxes:
                 if box.message in DRIVING:
-                    of_mailbox[box.name].append(marks.write)
-                of_mailbox[box.name] += _of_arm(stream, box, config, ran.cell, goals)
+                    parts_by_mailbox[box.name].append(marks.write)
+                parts_by_mailbox[box.name] += _of_arm(stream, box, config, ran.cell, goals)
         lockstep = config.clock.mode == "lockstep"
-        tick_ns = layout.clock_ns if lockstep else config.tick_ns  # of what traces measure
+        # Traces measure real time, in which a tick of lockstep has no fixed length.
+        tick_ns = layout.clock_ns if lockstep else config.tick_ns
         colours = colours_of(layout)
         boards = boards_of(layout)
         write_legend(stream, LOAD, boards, [colours[board] for board in boards])
         self._hierarchy = Hierarchy(stream, layout, rack_timing(config, layout))
-        of_task: dict[str, list[ViewPart]] = {
+        parts_by_task: dict[str, list[ViewPart]] = {
             task.name: [
                 partial(self._hierarchy.write, task.name),
                 cycle_lane(stream, task, layout.clock_ns / tick_ns, lockstep),
@@ -138,27 +145,33 @@ class RackWriter:
             ]
             for task in layout.tasks
         }
-        # The mailboxes of operators and host boards, and queues, have no age: they are not written
-        # periodically.
+        # Mailboxes of operators and host boards, and queues, have no age, because they are not
+        # written periodically.
         periodic = [box for box in layout.timed if box.writer != CLOCK and box.protocol != "queue"]
         self._ages = {
             mailbox.name: Age(stream, mailbox, layout, colours[mailbox.writer])
             for mailbox in periodic
         }
         for mailbox, age in self._ages.items():
-            of_mailbox[mailbox].append(age.write)
-        self._parts = of_task | of_mailbox
+            parts_by_mailbox[mailbox].append(age.write)
+        self._parts = parts_by_task | parts_by_mailbox
         self._events = Events(stream, ran.events, self._hierarchy, marks)
         self._write_losses = row_losses(stream)
         self._fastest = min(layout.tasks, key=lambda task: task.every).name
 
-    def write(self, taken: Mapping[str, np.ndarray], tick: int, lost: Mapping[str, int]) -> None:
-        """Write the rows of all rings, each (rows,), by ring: everything before `tick`. `lost`
-        counts rows by ring.
+    def write(
+        self, rows_by_ring: Mapping[str, np.ndarray], tick: int, lost: Mapping[str, int]
+    ) -> None:
+        """Write a block of rows, which contains everything before `tick`.
+
+        Args:
+            rows_by_ring: Rows, each of shape (rows,), by ring.
+            tick: Tick at which the block ends.
+            lost: Number of lost rows, by ring.
         """
-        if (fastest := taken.get(self._fastest)) is not None:
+        if (fastest := rows_by_ring.get(self._fastest)) is not None:
             self._times.learn(fastest["tick"], fastest["start_ns"])
-        for ring, rows in taken.items():
+        for ring, rows in rows_by_ring.items():
             block = RowBlock(rows, self._times)
             for write in self._parts[ring]:
                 write(block)
@@ -169,17 +182,16 @@ class RackWriter:
         self._write_losses(tick, lost)
 
     def skip(self, tick: int) -> None:
-        """Go on at a tick: nothing is recorded of what was before."""
+        """Continue at a tick before which nothing is recorded."""
         for age in self._ages.values():
             age.skip(tick)
 
 
 class ViewSink:
-    """Writes run.rrd of one rack into `folder`, a long run in parts; with a port, also serves it to
-    a viewer.
+    """Writes run.rrd of a rack into `folder`, in parts for a long run.
 
-    The server of a viewer cannot change files: what it shows live is one part, however long. Of a
-    rack with a flight recorder there is no file.
+    With a port it also serves a viewer, and then everything is in one part, because the viewer's
+    server cannot change files. A rack with a flight recorder gets no file.
     """
 
     def __init__(self, segment: Segment, folder: Path, port: int | None) -> None:
@@ -208,10 +220,9 @@ class ViewSink:
             self._waiting[ring].append(rows)
 
     def advance(self, tick: int, lost: Mapping[str, int]) -> None:
-        """Write a block if one is full; everything before `tick` has been taken. `lost` counts rows
-        by ring.
+        """Write a block if one is full. Everything before `tick` has been added.
 
-        Raises `RuntimeError` when the file cannot be written.
+        `lost` counts lost rows by ring. Raises `RuntimeError` if the file cannot be written.
         """
         if tick - self._written >= self._block:
             self._write(tick, lost)
@@ -221,12 +232,13 @@ class ViewSink:
                 self._stream.continue_in(next_file(self._folder))
 
     def close(self, tick: int, lost: Mapping[str, int]) -> None:
-        """Write what waits and finish the file. Raises `RuntimeError` when it cannot be written."""
+        """Write the remaining rows and finish the file. Raises `RuntimeError` if that fails."""
         self._write(tick, lost)
         self._stream.flush()
         self._stream.close()
 
     def _write(self, tick: int, lost: Mapping[str, int]) -> None:
+        """Write the waiting rows as a block, and the load of the recorder."""
         self._written = tick
         waiting = self._waiting
         self._waiting = defaultdict(list)
@@ -237,14 +249,12 @@ class ViewSink:
 
 
 def block_of(layout: Layout) -> int:
-    """Return the ticks of one block."""
+    """Return the number of ticks in a block."""
     return max(1, round(BLOCK_S * 1e9 / layout.clock_ns))
 
 
 def _of_any(stream: Stream, mailbox: MailboxSpec) -> Iterator[ViewPart]:
-    """Yield the parts of the view for a mailbox, by its message type, so that any rack has a
-    view.
-    """
+    """Yield the parts that show a mailbox of any rack, chosen by its fields and message type."""
     names = {field.name for field in mailbox.fields}
     board, _, port = mailbox.name.partition(".")
     kind = mailbox.message
@@ -264,7 +274,15 @@ def _of_any(stream: Stream, mailbox: MailboxSpec) -> Iterator[ViewPart]:
 def _of_arm(
     stream: Stream, mailbox: MailboxSpec, config: RackConfig, cell: Cell, goals: Goals
 ) -> Iterator[ViewPart]:
-    """Yield the parts that show a mailbox in the cell, or as curves of the arm."""
+    """Yield the parts that show a mailbox in the cell, or as curves of the arm.
+
+    Args:
+        stream: Where they are written.
+        mailbox: The mailbox.
+        config: Config of the rack.
+        cell: Cell of the arm.
+        goals: Writer of the goals, shared by the plan and the status of moves.
+    """
     robot = config.robot
     assert robot is not None, "there is an arm"
     match mailbox.message:

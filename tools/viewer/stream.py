@@ -1,8 +1,7 @@
-"""The recording for the viewer, as a stream: to a file always, and to a viewer on this machine if
-one is wanted.
+"""The recording for the viewer as a stream into a file, to a viewer on this machine, or both.
 
-Its rows have three timelines: simulated time, tick, wall clock. They come in blocks, of one mailbox
-or one task.
+Its rows have three timelines: simulated time, tick and wall clock. They are written in blocks, each
+with rows of one mailbox or task.
 """
 
 from __future__ import annotations
@@ -26,24 +25,27 @@ SIM_TIME = "sim_time"
 TICK = "tick"
 WALL = "wall"
 KEPT = 4096
-"""Pairs of tick and time kept, to place what has a tick but no time stamp."""
+"""Number of remembered pairs of tick and time, which place events that have no time stamp."""
 APPLICATION = "rack"
 LOG = "log"
 FLUSH_S = 0.5
-"""Longest single wait for the disk: the rings, not drained meanwhile, hold two seconds."""
+"""Longest wait for the disk in one call.
+
+The rings are not drained in that time, and hold two seconds.
+"""
 SERVER_MEMORY = "200MB"
-"""What the server keeps for a viewer that joins later."""
+"""Amount of data that the server keeps for a viewer that connects later."""
 
 
 class Moment(NamedTuple):
-    """When something happened: a tick, and a stamp of CLOCK_MONOTONIC."""
+    """A point in time: a tick, and a time stamp of CLOCK_MONOTONIC."""
 
     tick: int
     stamp_ns: int
 
 
 class RowTimes(NamedTuple):
-    """Times of rows, each (rows,): simulated, ns; tick; wall clock, ns."""
+    """Times of rows, each of shape (rows,): simulated time, ns; tick; wall clock, ns."""
 
     simulated_ns: Ints
     ticks: Ints
@@ -51,9 +53,9 @@ class RowTimes(NamedTuple):
 
 
 class Timelines:
-    """Converts ticks and CLOCK_MONOTONIC stamps to time columns; all integers, ns.
+    """Converts ticks and CLOCK_MONOTONIC stamps to times in the recording. All are integers, ns.
 
-    Of a rack `placed` on the time line of another one, all three are that one's.
+    If a rack is `placed` on the time line of another one, all three timelines are the other rack's.
     """
 
     def __init__(self, clock_ns: int, launch: Launch, placed: RackPlace | None = None) -> None:
@@ -64,8 +66,12 @@ class Timelines:
         self._stamps: Ints = np.array([launch.monotonic_ns])
 
     def times(self, ticks: Ints, stamps_ns: Ints, within_ns: Ints | int = 0) -> RowTimes:
-        """Return the times of rows released at `ticks`, `within_ns` of simulated time later,
-        stamped `stamps_ns`.
+        """Return the times of rows.
+
+        Args:
+            ticks: Release ticks, shape (rows,).
+            stamps_ns: Time stamps of CLOCK_MONOTONIC, shape (rows,).
+            within_ns: Simulated time after the release.
         """
         if (placed := self._placed) is None:
             return RowTimes(ticks * self.clock_ns + within_ns, ticks, stamps_ns + self._offset_ns)
@@ -75,42 +81,53 @@ class Timelines:
     def columns(
         self, ticks: Ints, stamps_ns: Ints, within_ns: Ints | int = 0
     ) -> list[rr.TimeColumn]:
-        """Return the same times as columns."""
-        found = self.times(ticks, stamps_ns, within_ns)
+        """Return the times of rows as columns of the recording.
+
+        Args:
+            ticks: Release ticks, shape (rows,).
+            stamps_ns: Time stamps of CLOCK_MONOTONIC, shape (rows,).
+            within_ns: Simulated time after the release.
+        """
+        times = self.times(ticks, stamps_ns, within_ns)
         return [
-            rr.TimeColumn(SIM_TIME, duration=found.simulated_ns.astype("timedelta64[ns]")),
-            rr.TimeColumn(TICK, sequence=found.ticks),
-            rr.TimeColumn(WALL, timestamp=found.wall_ns.astype("datetime64[ns]")),
+            rr.TimeColumn(SIM_TIME, duration=times.simulated_ns.astype("timedelta64[ns]")),
+            rr.TimeColumn(TICK, sequence=times.ticks),
+            rr.TimeColumn(WALL, timestamp=times.wall_ns.astype("datetime64[ns]")),
         ]
 
     def learn(self, ticks: Ints, stamps_ns: Ints) -> None:
-        """Remember when ticks happened; both are sorted."""
+        """Remember the time stamps of ticks. Both arrays are sorted."""
         new = ticks > self._ticks[-1]
         self._ticks = np.concatenate((self._ticks, ticks[new]))[-KEPT:]
         self._stamps = np.concatenate((self._stamps, stamps_ns[new]))[-KEPT:]
 
     def stamps_of(self, ticks: Ints) -> Ints:
-        """Return approximately when ticks happened, CLOCK_MONOTONIC, ns."""
-        # Relative to the newest, so that the 53 bits of a float suffice.
+        """Return the approximate CLOCK_MONOTONIC time of ticks, ns."""
+        # Interpolate relative to the newest stamp, because floats have only 53 bits.
         last = self._stamps[-1]
         return np.asarray(
             last + np.interp(ticks, self._ticks, self._stamps - last).astype(np.int64)
         )
 
     def moment_of(self, tick: int) -> Moment:
-        """Return approximately when a tick happened."""
+        """Return a tick with its approximate time."""
         return Moment(tick, int(self.stamps_of(np.array([tick]))[0]))
 
     def monotonic(self, time_ns: int) -> int:
-        """Return a CLOCK_REALTIME stamp as CLOCK_MONOTONIC."""
+        """Convert a CLOCK_REALTIME stamp to CLOCK_MONOTONIC."""
         return time_ns - self._offset_ns
 
 
 class RowBlock:
     """Rows of one ring, oldest first, with their times.
 
-    Rows of a mailbox have the fields of `rack.backplane.mailbox.history.MailboxRing`, those of a
-    trace the fields of `rack.backplane.trace.RECORD`.
+    The rows of a mailbox have the fields of `rack.backplane.mailbox.history.MailboxRing`, the rows
+    of a trace have the fields of `rack.backplane.trace.RECORD`.
+
+    Attributes:
+        rows: The rows, shape (rows,).
+        ticks: Release ticks, shape (rows,).
+        stamps_ns: Time stamps of CLOCK_MONOTONIC, shape (rows,).
     """
 
     def __init__(self, rows: np.ndarray, timelines: Timelines) -> None:
@@ -122,19 +139,19 @@ class RowBlock:
 
     @cached_property
     def times(self) -> list[rr.TimeColumn]:
-        """The time columns of all rows, made once for all parts that write them."""
+        """Time columns of all rows, built once for all parts that write them."""
         return self._timelines.columns(self.ticks, self.stamps_ns)
 
     def times_of(self, rows: Ints | list[int]) -> list[rr.TimeColumn]:
-        """Return the time columns of some rows, by their indices."""
+        """Return the time columns of the rows with these indices."""
         return self._timelines.columns(self.ticks[rows], self.stamps_ns[rows])
 
     def when(self, row: SupportsIndex) -> Moment:
-        """Return when a row was written."""
+        """Return the time at which a row was written."""
         return Moment(int(self.ticks[row]), int(self.stamps_ns[row]))
 
     def visible(self, row: SupportsIndex) -> Moment:
-        """Return the same for a mailbox's row, at the tick at which it is visible."""
+        """Return the tick at which a mailbox's row is visible, with the row's time stamp."""
         return Moment(int(self.rows["visible_at"][row]), int(self.stamps_ns[row]))
 
     @property
@@ -144,16 +161,19 @@ class RowBlock:
 
 
 ViewPart = Callable[[RowBlock], None]
-"""Writes one aspect of one mailbox or task to the stream, block by block."""
+"""A function that writes one aspect of a mailbox or task to the stream, block by block."""
 
 
 def change_finder() -> Callable[[np.ndarray], Ints]:
-    """Return a function that takes the values of consecutive blocks, (rows,) or structured, and
-    returns the indices of the rows that differ from the row before.
+    """Return a function that finds the rows that differ from the row before.
+
+    It takes the values of consecutive blocks, of shape (rows,) or structured, and returns indices
+    of rows. The very first row counts as a change.
     """
     last: np.ndarray | None = None
 
     def changed_rows(values: np.ndarray) -> Ints:
+        """Return the indices of rows that differ from the row before, across blocks."""
         nonlocal last
         changed = values != np.concatenate((values[:1] if last is None else last, values[:-1]))
         changed[0] |= last is None
@@ -164,17 +184,19 @@ def change_finder() -> Callable[[np.ndarray], Ints]:
 
 
 SHOWN_S = 0.02
-"""Time between things drawn: the rate of a screen."""
+"""Time between two drawn rows: the rate of a screen."""
 
 
 def row_sampler(clock_ns: int) -> Callable[[Ints], Ints]:
-    """Return a function that takes the ticks of consecutive blocks, and returns the indices of the
-    rows that are drawn: the first of every 20 ms of simulated time.
+    """Return a function that chooses the rows to draw, the first of every 20 ms of simulated time.
+
+    It takes the ticks of consecutive blocks, and returns indices of rows.
     """
     every = max(1, round(SHOWN_S * 1e9 / clock_ns))
     last = -1
 
     def sampled_rows(ticks: Ints) -> Ints:
+        """Return the index of the first row of each drawing interval, across blocks."""
         nonlocal last
         slots, first = np.unique(ticks // every, return_index=True)
         chosen = first[slots > last]
@@ -187,12 +209,16 @@ def row_sampler(clock_ns: int) -> Callable[[Ints], Ints]:
 def new_recording(
     name: str, run: str, file: Path | None, blueprint: rrb.Blueprint, port: int | None = None
 ) -> rr.RecordingStream:
-    """Return a recording to be written into a file, and served on a port of this machine, as far as
-    they are given.
+    """Open a recording that is written into a file, served on a port of this machine, or both.
 
-    Files of one `run` are shown as one recording.
+    Args:
+        name: Name that the viewer shows.
+        run: Id of the run. Files with the same id are shown as one recording.
+        file: The file, or None.
+        blueprint: The initial view.
+        port: The port, or None.
     """
-    # Otherwise a mistake is a warning on stderr and a gap in the recording.
+    # Without strict mode a mistake is only a warning on stderr and a gap in the recording.
     rr.set_strict_mode(True)
     recording = rr.RecordingStream(APPLICATION, recording_id=run)
     recording.set_log_time_enabled(False)
@@ -201,7 +227,7 @@ def new_recording(
     if file is not None:
         sinks.append(rr.FileSink(str(file)))
     if port is not None:
-        # A server, not a client: a client without its viewer would block the file as well.
+        # Use a server, not a client: a client without its viewer would also block the file.
         sinks.append(rr.GrpcServerSink("127.0.0.1", port, server_memory_limit=SERVER_MEMORY))
     recording.set_sinks(*sinks, default_blueprint=blueprint)
     recording.send_recording_name(name)
@@ -209,9 +235,10 @@ def new_recording(
 
 
 class Stream:
-    """What one rack adds to a recording. Entities are named by parts, which may hold any character.
+    """The part of a recording that one rack writes.
 
-    All of them are below `root`. `flush` raises `RuntimeError` once the file cannot be written.
+    Entities are named by parts, which may contain any character, and all are below `root`. `flush`
+    raises `RuntimeError` once the file cannot be written.
     """
 
     def __init__(
@@ -222,47 +249,69 @@ class Stream:
         self._root = root
 
     def frame(self, name: str) -> str:
-        """Return the name of a coordinate frame: frames are known to all entities of a
-        recording.
-        """
+        """Return the full name of a coordinate frame, since frames of a recording are global."""
         return "/".join((*self._root, name))
 
     def within(self, frame: str) -> rr.CoordinateFrame:
-        """Return what puts an entity into a frame."""
+        """Return the component that puts an entity into a frame."""
         return rr.CoordinateFrame(self.frame(frame))
 
     def _path(self, entity: Sequence[str]) -> str:
+        """Return the path of an entity, below the root."""
         return path(*self._root, *entity)
 
     def static(self, entity: Sequence[str], *archetypes: rr.AsComponents) -> None:
-        """Log what holds at all times."""
+        """Log data that hold at all times."""
         self._recording.log(self._path(entity), *archetypes, static=True)
 
     def columns(
         self, entity: Sequence[str], times: list[rr.TimeColumn], columns: rr.ComponentColumnList
     ) -> None:
-        """Send a block of rows."""
+        """Send a block of rows.
+
+        Args:
+            entity: The entity.
+            times: Times of the rows.
+            columns: Components of the rows.
+        """
         self._recording.send_columns(self._path(entity), times, columns)
 
     def scalars(
         self, entity: Sequence[str], times: list[rr.TimeColumn], values: np.ndarray
     ) -> None:
-        """Send a block of curves, shape (rows,) or (rows, curves)."""
+        """Send a block of curves.
+
+        Args:
+            entity: The entity.
+            times: Times of the rows.
+            values: Values, shape (rows,) or (rows, curves).
+        """
         self.columns(entity, times, rr.Scalars.columns(scalars=values))
 
     def at(self, when: Moment, entity: Sequence[str], archetype: rr.AsComponents) -> None:
-        """Log a single item."""
-        found = self.times.times(np.array([when.tick]), np.array([when.stamp_ns]))
+        """Log a single item.
+
+        Args:
+            when: Its time.
+            entity: The entity.
+            archetype: The item.
+        """
+        times = self.times.times(np.array([when.tick]), np.array([when.stamp_ns]))
         self._recording.set_time(
-            SIM_TIME, duration=np.timedelta64(int(found.simulated_ns[0]), "ns")
+            SIM_TIME, duration=np.timedelta64(int(times.simulated_ns[0]), "ns")
         )
-        self._recording.set_time(TICK, sequence=int(found.ticks[0]))
-        self._recording.set_time(WALL, timestamp=np.datetime64(int(found.wall_ns[0]), "ns"))
+        self._recording.set_time(TICK, sequence=int(times.ticks[0]))
+        self._recording.set_time(WALL, timestamp=np.datetime64(int(times.wall_ns[0]), "ns"))
         self._recording.log(self._path(entity), archetype)
 
     def say(self, when: Moment, source: str, text: str, level: str) -> None:
-        """Write a line to the log, under its source; of a rack among several it begins with the
-        rack's name.
+        """Write a line to the log. Of a rack among several, it begins with the rack's name.
+
+        Args:
+            when: Time of the line.
+            source: Entity below the log to which it belongs.
+            text: The line.
+            level: Log level of rerun.
         """
         line = rr.TextLog(": ".join((*self._root, text)), level=level)
         self.at(when, (LOG, source), line)
@@ -272,11 +321,11 @@ class Stream:
         self._recording.send_property(" ".join((*self._root, name)), values)
 
     def flush(self) -> None:
-        """Write everything to the file. Raises `RuntimeError` when that fails."""
+        """Write everything to the file. Raises `RuntimeError` if that fails."""
         self._recording.flush(timeout_sec=FLUSH_S)
 
     def continue_in(self, file: Path) -> None:
-        """Finish the file and go on in another, which is of the same run."""
+        """Finish the file, and continue in another file of the same run."""
         self._recording.set_sinks(rr.FileSink(str(file)))
 
     def close(self) -> None:

@@ -1,6 +1,6 @@
-"""Colours, one meaning each, and lanes: spans of coloured states over time.
+"""Colours of the view, each with one meaning, and lanes, which are spans of coloured states.
 
-rerun marks the archetype of lanes as unstable, so it is used only here.
+rerun marks the archetype of lanes as unstable, so only this module uses it.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import rerun.blueprint as rrb
 from rack.tools.viewer.stream import Moment, RowBlock, Stream, ViewPart
 
 Colour = int
-"""0xRRGGBBAA."""
+"""A colour, 0xRRGGBBAA."""
 
 _JOINTS: tuple[Colour, ...] = (
     0x56B4E9FF,
@@ -25,7 +25,7 @@ _JOINTS: tuple[Colour, ...] = (
     0xD55E00FF,
     0x968CFFFF,
 )
-"""Distinguishable without red or green vision (Okabe and Ito)."""
+"""Colours that can be told apart without red or green vision (Okabe and Ito)."""
 COMMANDED: Colour = 0x828282A0
 LIMIT: Colour = 0xC83C3C6E
 PLANNED: Colour = 0xFFC828FF
@@ -35,11 +35,11 @@ FORCE: Colour = 0xF03C3CFF
 LOST: Colour = 0xE63232FF
 GRID: Colour = 0xFFFFFF78
 OVERLAID = (2.5, 1.0)
-"""Widths of two curves: the lower one shows on both sides where the two agree."""
+"""Widths of two curves, so that the lower one shows on both sides where they coincide."""
 LEGEND = "legend"
 LEGEND_ROW = 30.0
 LEGEND_LETTER = 7.0
-"""Distance between names of a legend, and width of a letter, in the units of a graph."""
+"""Distance between the names of a legend and width of a letter, in the units of a graph."""
 
 _GREY: Colour = 0x6E6E78FF
 _BLUE: Colour = 0x468CE6FF
@@ -68,7 +68,7 @@ EVENT_COLOURS: dict[str, Colour] = {
     "reaction": 0xDC5A3CFF,
     "recovery": _GREEN,
 }
-"""By kind; the viewer picks a colour for any other."""
+"""Colours by kind of event. The viewer chooses a colour for any other kind."""
 PHASES: dict[str, Colour] = {
     "wait": 0x3C3E46FF,
     "read": 0x5AAADCFF,
@@ -78,28 +78,26 @@ PHASES: dict[str, Colour] = {
     "missed": 0xE63232FF,
 }
 LETTERS = {"wait": " ", "read": "R", "process": "X", "plan": "P", "write": "W", "missed": "!"}
-"""Labels of phases, as in the paper's figures: words would not fit into their spans."""
+"""Labels of phases, as in the paper's figures, because words would not fit into their spans."""
 
 
-def of_joint(at: int) -> Colour:
+def of_joint(index: int) -> Colour:
     """Return the colour of a joint by its index, from base to tool."""
-    return _JOINTS[at % len(_JOINTS)]
+    return _JOINTS[index % len(_JOINTS)]
 
 
 def of_joints(count: int) -> list[Colour]:
-    """Return the colours of this many joints, from base to tool."""
-    return [of_joint(at) for at in range(count)]
+    """Return the colours of `count` joints, from base to tool."""
+    return [of_joint(index) for index in range(count)]
 
 
 def dimmed(colour: Colour) -> Colour:
-    """Return a colour of which less is seen."""
+    """Return a colour with reduced opacity."""
     return colour & ~0xFF | 110
 
 
 def packed(colours: Iterable[Colour]) -> np.ndarray:
-    """Return colours as rerun takes any number of them: three or four plain numbers are one colour
-    to it.
-    """
+    """Pack colours into an array, since rerun takes three or four plain numbers as one colour."""
     return np.array(list(colours), np.uint32)
 
 
@@ -109,15 +107,21 @@ def style_lane(
     colours: Mapping[str, Colour],
     labels: Mapping[str, str] | None = None,
 ) -> None:
-    """Set the colours of a lane's states, and their labels: without `labels` their own names.
+    """Set the colours and labels of a lane's states. The viewer chooses colours for other states.
 
-    The viewer picks a colour for any other state.
+    Args:
+        stream: Where they are written.
+        entity: The lane.
+        colours: Colour of each state.
+        labels: Label of each state. Defaults to the names of the states.
     """
     shades = packed(colours.values())
-    shown = list(colours)
+    shown_labels = list(colours)
     if labels is not None:
-        shown = [labels[name] for name in colours]
-    stream.static(entity, rr.StateConfiguration(values=list(colours), labels=shown, colors=shades))
+        shown_labels = [labels[name] for name in colours]
+    stream.static(
+        entity, rr.StateConfiguration(values=list(colours), labels=shown_labels, colors=shades)
+    )
 
 
 def style_curves(
@@ -127,8 +131,14 @@ def style_curves(
     colours: Sequence[Colour] | None = None,
     widths: Sequence[float] | None = None,
 ) -> None:
-    """Set names, colours and widths of an entity's curves; without colours the viewer picks
-    them.
+    """Set names, colours and widths of an entity's curves.
+
+    Args:
+        stream: Where they are written.
+        entity: The entity.
+        names: Names of the curves.
+        colours: Their colours. By default the viewer chooses them.
+        widths: Their widths. By default the viewer's.
     """
     shades = None if colours is None else packed(colours)
     stream.static(entity, rr.SeriesLines(names=names, colors=shades, widths=widths))
@@ -149,22 +159,35 @@ def curves(
         entity: The entity.
         values: Returns the values of all rows of a block, (rows,) or (rows, curves).
         names: Names of the curves, with their units.
-        colours: Their colours; without them the viewer picks some.
-        widths: Their widths.
+        colours: Their colours. By default the viewer chooses them.
+        widths: Their widths. By default the viewer's.
     """
     style_curves(stream, entity, names, colours, widths)
     return lambda block: stream.scalars(entity, block.times, values(block))
 
 
 def write_legend(stream: Stream, what: str, names: Sequence[str], colours: list[Colour]) -> None:
-    """Write names in their colours, one below the other: a legend within a plot covers curves."""
+    """Write a legend as a separate graph, because a legend within a plot would cover curves.
+
+    Args:
+        stream: Where it is written.
+        what: Name of the legend.
+        names: Its entries, from top to bottom.
+        colours: Their colours.
+    """
     places = [(0.0, LEGEND_ROW * row) for row in range(len(names))]
     nodes = rr.GraphNodes(names, labels=names, positions=places, colors=packed(colours))
     stream.static((LEGEND, what), nodes)
 
 
 def legend_view(origin: str, name: str, names: Sequence[str]) -> rrb.View:
-    """Return a view of a legend of these names."""
+    """Return a view of a legend.
+
+    Args:
+        origin: Path of the legend's entity.
+        name: Title of the view.
+        names: Entries of the legend.
+    """
     half = LEGEND_LETTER * max(map(len, names)) / 2 + LEGEND_ROW / 2
     rows = (-LEGEND_ROW, LEGEND_ROW * len(names))
     bounds = rrb.VisualBounds2D(x_range=(-half, half), y_range=rows)
@@ -174,23 +197,42 @@ def legend_view(origin: str, name: str, names: Sequence[str]) -> rrb.View:
 def write_spans(
     stream: Stream, entity: Sequence[str], times: list[rr.TimeColumn], states: Sequence[str]
 ) -> None:
-    """Write the states that begin at `times`; each lasts until the next, and "" is none."""
+    """Write the states of a lane. Each lasts until the next one, and "" means no state.
+
+    Args:
+        stream: Where they are written.
+        entity: The lane.
+        times: Times at which the states begin.
+        states: The states.
+    """
     stream.columns(entity, times, rr.StateChange.columns(state=states))
 
 
 def write_span(stream: Stream, when: Moment, entity: Sequence[str], state: str) -> None:
-    """Write one state that begins then."""
+    """Write one state of a lane.
+
+    Args:
+        stream: Where it is written.
+        when: Time at which the state begins.
+        entity: The lane.
+        state: The state, or "" for none.
+    """
     stream.at(when, entity, rr.StateChange(state=state))
 
 
 def lanes_view(name: str, contents: Sequence[str], around_s: float | None = None) -> rrb.View:
-    """Return a view of lanes: of the whole run, or of `around_s` before and after the time
-    cursor.
+    """Return a view of lanes.
+
+    Args:
+        name: Title of the view.
+        contents: Queries for the lanes.
+        around_s: Time to show before and after the time cursor. Defaults to the whole run.
     """
     axis = rrb.TimeAxis(link="LinkToGlobal")
     if around_s is not None:
         begin, end = (
-            rrb.TimeRangeBoundary.cursor_relative(seconds=at) for at in (-around_s, around_s)
+            rrb.TimeRangeBoundary.cursor_relative(seconds=offset_s)
+            for offset_s in (-around_s, around_s)
         )
         axis = rrb.TimeAxis(link="Independent", view_range=rrb.TimeRange(start=begin, end=end))
     return rrb.StateTimelineView(origin="/", contents=list(contents), name=name, time_view=axis)

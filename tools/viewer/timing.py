@@ -1,6 +1,4 @@
-"""The timing of a rack in the view: lanes and curves of every task, from its trace, and the ages of
-messages.
-"""
+"""The timing of a rack in the view: lanes and curves of tasks, and ages of messages."""
 
 from __future__ import annotations
 
@@ -39,16 +37,21 @@ AGES = "ages"
 MOMENTS = ("start_ns", "read_ns", "process_ns", "end_ns")
 MISSED = "missed"
 SPAN_S = 0.25
-"""Time marked around a missed cycle: the cycle itself would be too narrow to be visible."""
+"""Time that is marked around a missed cycle, which itself would be too narrow to see."""
 
 
 def cycle_lane(stream: Stream, task: TaskSpec, speed: float, lockstep: bool) -> ViewPart:
-    """Return the part that writes trace records as four spans a cycle: read, process or plan,
-    write, wait. Missed cycles are red.
+    """Return the part that shows each cycle as four spans: read, process or plan, write, wait.
 
-    In real time a span is where it was on the wall clock, scaled to simulated time by `speed`. In
-    lockstep, where simulated time stands still meanwhile, it begins at its tick and is cut at the
-    end of its time slice.
+    Missed cycles are red. In real time the spans have their position on the wall clock, scaled to
+    simulated time. In lockstep, where simulated time does not pass during a cycle, they begin at
+    the tick and are cut at the end of the time slice.
+
+    Args:
+        stream: Where it is written.
+        task: The task.
+        speed: Simulated time per wall-clock time.
+        lockstep: Whether the run is in lockstep.
     """
     lane = (BOARDS, f"{task.slot}-{task.board}", task.role)  # in the order of slots
     last_ns = task.slice * stream.times.clock_ns - len(MOMENTS)
@@ -56,11 +59,12 @@ def cycle_lane(stream: Stream, task: TaskSpec, speed: float, lockstep: bool) -> 
     style_lane(stream, lane, PHASES, LETTERS)
 
     def write(block: RowBlock) -> None:
+        """Write the four spans of each cycle in a block."""
         rows = block.rows
         moments = np.stack([rows[name] for name in MOMENTS], axis=1)
         within = ((moments - rows["release_ns"][:, None]) * speed).astype(np.int64)
         if lockstep:
-            # Cut spans keep their order: no two of a lane begin at the same time.
+            # Cut spans keep distinct begins and their order.
             within = np.minimum(within, last_ns + np.arange(len(MOMENTS)))
         ticks = np.repeat(block.ticks, len(MOMENTS))
         states = np.array([["read", work, "write", "wait"]] * len(rows))
@@ -72,36 +76,44 @@ def cycle_lane(stream: Stream, task: TaskSpec, speed: float, lockstep: bool) -> 
 
 
 def boards_of(layout: Layout) -> list[str]:
-    """Return the boards, in the order of their tasks."""
+    """Return the boards in the order of their tasks."""
     return list(dict.fromkeys(task.board for task in layout.tasks))
 
 
 def colours_of(layout: Layout) -> dict[str, Colour]:
-    """Return a colour for each task, by name; a planner has its board's, dimmed."""
+    """Return a colour for each task, by name. A planner has the dimmed colour of its board."""
     boards = boards_of(layout)
-    own = {task.name: of_joint(boards.index(task.board)) for task in layout.tasks}
-    return {name: dimmed(colour) if "." in name else colour for name, colour in own.items()}
+    by_task = {task.name: of_joint(boards.index(task.board)) for task in layout.tasks}
+    return {name: dimmed(colour) if "." in name else colour for name, colour in by_task.items()}
 
 
 def load_curves(
     stream: Stream, task: TaskSpec, colour: Colour, period_ns: int, is_lockstep: bool
 ) -> Iterator[ViewPart]:
-    """Yield the parts that write trace records as curves: lateness, execution and deadline in ms,
-    and the used part of the time slice, whose 100 % are the deadline.
+    """Yield the parts that show the times of a task as curves.
 
-    In lockstep a tick lasts as long as its tasks take: there is only execution, without anything to
-    compare it with.
+    These are lateness, execution and deadline in ms, and the used part of the time slice, whose 100
+    % are the deadline. In lockstep a tick lasts as long as its tasks take, so only execution is
+    shown.
+
+    Args:
+        stream: Where they are written.
+        task: The task.
+        colour: Its colour.
+        period_ns: Length of a tick on the wall clock.
+        is_lockstep: Whether the run is in lockstep.
     """
     slice_ns = task.slice * period_ns
 
     def times_ms(block: RowBlock) -> np.ndarray:
+        """Return lateness, execution and deadline of each cycle, (rows, 3), ms."""
         rows = block.rows
-        found = np.full((len(rows), 3), np.nan)
-        found[:, 1] = execution_ns(rows) * 1e-6
+        columns = np.full((len(rows), 3), np.nan)
+        columns[:, 1] = execution_ns(rows) * 1e-6
         if not is_lockstep:
-            found[:, 0] = lateness_ns(rows) * 1e-6
-            found[:, 2] = slice_ns * 1e-6
-        return found
+            columns[:, 0] = lateness_ns(rows) * 1e-6
+            columns[:, 2] = slice_ns * 1e-6
+        return columns
 
     names = [f"{task.name} {name}" for name in ("lateness, ms", "execution, ms", "deadline, ms")]
     yield curves(stream, (TIMES, task.name), times_ms, names, [COMMANDED, colour, LIMIT])
@@ -116,13 +128,15 @@ def load_curves(
 
 
 def missed_cycles(stream: Stream, task: TaskSpec) -> ViewPart:
-    """Return the part that writes missed cycles: as a lane that shows them at any zoom, and as one
-    log line a block. A task that never misses has no lane.
+    """Return the part that shows missed cycles as a lane, and as one log line per block.
+
+    The lane is visible at any zoom. A task that never misses has no lane.
     """
     lane = (LEVELS, task.board, f"{task.role}_{MISSED}")
     span = max(1, round(SPAN_S * 1e9 / stream.times.clock_ns))
 
     def write(block: RowBlock) -> None:
+        """Mark the missed cycles of a block, and log them."""
         missed = np.flatnonzero(is_missed(block.rows))
         if not len(missed):
             return
@@ -142,18 +156,16 @@ def missed_cycles(stream: Stream, task: TaskSpec) -> ViewPart:
 
 
 class Age:
-    """Writes, at every release of a mailbox's fastest reader, the age in ms of the message that is
-    visible then.
-    """
+    """Writes the age of a mailbox's visible message, ms, at every release of its fastest reader."""
 
     def __init__(
         self, stream: Stream, mailbox: MailboxSpec, layout: Layout, colour: Colour
     ) -> None:
         self._stream = stream
         self._lane = (AGES, mailbox.name)
-        own = TickGrid(mailbox.every, mailbox.phase)
+        own_grid = TickGrid(mailbox.every, mailbox.phase)
         self._releases = min(
-            [layout.read_grid(mailbox, reader) for reader in mailbox.readers], default=own
+            [layout.read_grid(mailbox, reader) for reader in mailbox.readers], default=own_grid
         )
         self._visible_at: Ints = np.empty(0, dtype=np.int64)
         self._made: Ints = np.empty(0, dtype=np.int64)
@@ -161,19 +173,20 @@ class Age:
         style_curves(stream, self._lane, [f"{mailbox.name}, ms"], [colour])
 
     def write(self, block: RowBlock) -> None:
-        """Take messages; they count from the tick at which they become visible."""
+        """Add messages. They count from the tick at which they become visible."""
         self._visible_at = np.concatenate((self._visible_at, block.rows["visible_at"]))
         self._made = np.concatenate((self._made, block.ticks))
 
     def skip(self, tick: int) -> None:
-        """Go on at a tick, with no message from before."""
+        """Continue at a tick, without any message from before."""
         self._upto = tick - 1
         self._visible_at = self._visible_at[:0]
         self._made = self._made[:0]
 
     def advance(self, tick: int) -> None:
-        """Write the ages at all releases before `tick`; every message visible before it has been
-        taken.
+        """Write the ages at all releases before `tick`.
+
+        All messages that were visible before that tick must have been added.
         """
         releases = np.arange(self._releases.since(self._upto + 1), tick, self._releases.every)
         self._upto = max(self._upto, tick - 1)

@@ -1,5 +1,6 @@
-"""The viewer's window: a separate process, which may be closed at any time and outlives the command
-that opened it.
+"""The window of the viewer, a separate process that outlives the command that opened it.
+
+The user may close it at any time.
 """
 
 from __future__ import annotations
@@ -21,25 +22,25 @@ PANIC = "panicked at "
 
 
 class ViewerWindow:
-    """A viewer that shows a recording's files or a recorder's stream; with a `port` it accepts
-    commands there.
+    """A viewer that shows the files of a recording, or the stream of a recorder.
 
-    Raises `Failure` when none is installed, or there is no screen and it is not `headless`.
+    With a `port` it accepts commands on that port. Raises `Failure` if no viewer is installed, or
+    if there is no screen and `headless` is False.
     """
 
     def __init__(self, *sources: str, headless: bool = False, port: int | None = None) -> None:
         if not (headless or has_screen()):
             raise Failure(
-                "no screen: DISPLAY and WAYLAND_DISPLAY are not set; on a machine with one: rerun"
-                f" {' '.join(sources)}"
+                "no screen: DISPLAY and WAYLAND_DISPLAY are not set; on a machine with a screen,"
+                f" run: rerun {' '.join(sources)}"
             )
-        # By default the viewer would listen on every network.
+        # By default the viewer would listen on all network interfaces.
         command = [executable(), "--bind", HOST, *sources]
         if headless:
             command += ["--headless", "--hide-welcome-screen"]
         if port is not None:
             command += ["--port", str(port)]
-        # A file, not a pipe: nobody reads it while the viewer is open.
+        # Use a file, not a pipe, because nobody reads it while the viewer is open.
         self._said = tempfile.TemporaryFile()  # noqa: SIM115  open as long as the window
         self._process = subprocess.Popen(
             command,
@@ -52,55 +53,55 @@ class ViewerWindow:
         self._is_reported = False
 
     def news(self) -> list[str]:
-        """Return how the window ended, once; nothing while it is open."""
+        """Return once how the window ended, and nothing while it is open."""
         if self._is_reported or self.is_open:
             return []
         self._is_reported = True
         return [self.wait() or "the viewer was closed"]
 
     def wait(self) -> str:
-        """Wait until the window is closed; return what went wrong, or an empty text."""
+        """Wait until the window is closed. Returns the error, or "" if there was none."""
         if (status := self._process.wait()) == 0:
             return ""
         self._said.seek(0)
-        said = self._said.read().decode(errors="replace").strip().splitlines()
-        # A panic prints its cause first, then a trace.
-        panic = [line.partition(PANIC)[2] for line in said if PANIC in line]
-        return ": ".join([f"the viewer ended with status {status}", *(panic or said[-1:])[:1]])
+        lines = self._said.read().decode(errors="replace").strip().splitlines()
+        # A panic prints its cause before the trace.
+        panic = [line.partition(PANIC)[2] for line in lines if PANIC in line]
+        return ": ".join([f"the viewer ended with status {status}", *(panic or lines[-1:])[:1]])
 
     def ends_within(self, bound_s: float) -> bool:
-        """Wait for its end, at most so long; return whether it came."""
+        """Wait at most `bound_s` for the window to end. Returns True if it has."""
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(bound_s)
         return not self.is_open
 
     @property
     def is_open(self) -> bool:
-        """Whether the viewer runs."""
+        """True while the viewer runs."""
         return self._process.poll() is None
 
     def close(self) -> None:
-        """Close it."""
+        """Close the window."""
         self._is_reported = True
         if self.is_open:
-            # The command is a script that starts the viewer: both are in its process group.
+            # The command is a script that starts the viewer. Both are in its process group.
             os.killpg(self._process.pid, signal.SIGTERM)
             self._process.wait()
         self._said.close()
 
 
 def has_screen() -> bool:
-    """Return whether a window can be opened."""
+    """Return True if a window can be opened."""
     return any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
 
 
 def executable() -> str:
-    """Return the viewer that came with the installed package. Raises `Failure`."""
-    own = Path(sys.executable).with_name("rerun")
-    found = str(own) if own.is_file() else shutil.which("rerun")
-    if found is None:
+    """Return the path of the installed viewer. Raises `Failure` if there is none."""
+    beside_python = Path(sys.executable).with_name("rerun")
+    path = str(beside_python) if beside_python.is_file() else shutil.which("rerun")
+    if path is None:
         raise Failure("the viewer 'rerun' is not installed; 'make run' installs it")
-    return found
+    return path
 
 
 def free_port() -> int:
@@ -111,5 +112,5 @@ def free_port() -> int:
 
 
 def url(port: int) -> str:
-    """Return the address at which a recorder serves its stream."""
+    """Return the address of the stream that a recorder serves on a port."""
     return f"rerun+http://{HOST}:{port}/proxy"

@@ -1,6 +1,4 @@
-"""A hand of fingers driven by pairs of tendons: its plant, and its loops from tendon tension to
-grasp.
-"""
+"""A hand with tendon-driven fingers: its plant, and its loops from tendon tension to grasp."""
 
 from rack.levels.systems.hand.executor import HandExecutor
 from rack.levels.systems.hand.grasp import GraspExecutor

@@ -82,7 +82,13 @@ class HandExecutor(Executor):
     def misfits(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Misfits:
-        """Yield every joint that is not driven by exactly one board above."""
+        """Yield every joint that is not driven by exactly one board above.
+
+        Args:
+            context: Context of this board.
+            above: Contexts of the boards above it.
+            below: Contexts of the boards below it.
+        """
         hand = context.robot.hand
         if hand is None:
             yield (
@@ -199,7 +205,10 @@ SLACK_CYCLES = 5
 """Consecutive slack cycles after which a tendon counts as torn. An opening valve takes up to four
 cycles to tighten a tendon."""
 SLACK_PART = 0.5
-"""Fraction of the least tension below which a tendon is slack; an intact one never gets there."""
+"""Fraction of the least tension below which a tendon is slack.
+
+The tension of an intact tendon stays above it.
+"""
 
 
 class SlackMonitor:
@@ -251,7 +260,7 @@ class Tensions(CommandsAbove):
         self.rests_on = 0  # serial of the newest operator command on which the tensions depend
 
     def merge_commands(self, tensions: Mapping[str, Reading[TensionCommand]]) -> None:
-        """Set `tension` and `rests_on`. Only valid if `missing` returned no reason."""
+        """Set `tension` and `rests_on`. Only valid if `find_missing` returned no reason."""
         self.rests_on = 0
         for board in self.oldest:
             value = tensions[board].message

@@ -100,8 +100,12 @@ class GraspExecutor(Executor):
     def misfits(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Misfits:
-        """Yield a robot without a hand, and every finger that is not driven by exactly one board
-        below.
+        """Yield a robot without a hand, and fingers that are not driven by exactly one board below.
+
+        Args:
+            context: Context of this board.
+            above: Contexts of the boards above it.
+            below: Contexts of the boards below it.
         """
         hand = context.robot.hand
         if hand is None:
@@ -192,8 +196,9 @@ class GraspExecutor(Executor):
         return max((reading.message for reading in plans.values()), key=lambda plan: plan.id)
 
     def _needs_plan(self) -> bool:
-        """Return whether the current step takes its numbers from a plan: a CLOSE, or the PRESHAPE
-        before it.
+        """Return True if the current step takes its numbers from a plan.
+
+        This applies to a CLOSE step and to the PRESHAPE step before it.
         """
         kinds = [type(step) for step in self._program.step[self._done : self._done + 2]]
         return kinds[:1] == [CloseStep] or kinds == [PreshapeStep, CloseStep]
@@ -236,9 +241,7 @@ class GraspExecutor(Executor):
         grasp.grip = HandGrip(grasp.params, gripping, self._opposing, self.context.period_s)
 
     def _prepare_step(self, index: int) -> Step:
-        """Return a step of the program, completed from the plan, with displacements in the frame of
-        the palm.
-        """
+        """Return a step of the program, completed from the plan, in the frame of the palm."""
         step = self._program.step[index]
         plan = self._plan
         if isinstance(step, ShiftStep):

@@ -1,5 +1,6 @@
-"""The program of a grasp, in `[task]`: named postures of the fingers, and steps that begin and end
-with an open hand.
+"""The program of a grasp in `[task]`: named postures of the fingers, and steps.
+
+The steps begin and end with an open hand.
 """
 
 from __future__ import annotations
@@ -29,10 +30,10 @@ class PreshapeStep(Table):
 
 
 class CloseStep(Table):
-    """Move the tips at constant speed towards points in an object until each touches it. A tip that
-    reaches its point has missed the object.
+    """Move the tips at constant speed towards points in an object until each touches it.
 
-    Without points, a plan from the level above defines fingers and points.
+    A tip that reaches its point has missed the object. Without points, a plan from the level above
+    defines fingers and points.
     """
 
     do: Literal["close"] = "close"
@@ -109,8 +110,9 @@ class GraspProgram(Program):
     """steps, executed in order"""
 
     def misfits(self, robot: RobotConfig | None, scene: SceneConfig) -> Misfits:
-        """Yield key, value and reason of everything that the hand or the scene lacks, and of steps
-        in the wrong order.
+        """Yield key, value and reason of mistakes in the program.
+
+        These are parts that the hand or the scene lacks, and steps in the wrong order.
         """
         if robot is None or robot.hand is None:
             return

@@ -36,8 +36,9 @@ SLIPPED_PART = 0.2
 
 
 class FingersBelow:
-    """State of all fingers, merged from the `FingerStatus` of each board. Points and forces are in
-    the frame of the palm.
+    """State of all fingers, merged from the `FingerStatus` of each board.
+
+    Points and forces are in the frame of the palm.
     """
 
     def __init__(self, context: LevelContext, fingers: Sequence[Ints]) -> None:
@@ -96,8 +97,9 @@ class GraspParams(GripGains):
 
 @dataclass
 class Grasp:
-    """State that all steps share: sensed fingers, object, and targets. Points are in the frame of
-    the palm.
+    """State that all steps share: sensed fingers, object, and targets.
+
+    Points are in the frame of the palm.
     """
 
     params: GraspParams
@@ -164,8 +166,9 @@ class StepWork(ABC):
 
 
 def minimum_jerk(time: float) -> tuple[float, float]:
-    """Return position, 0 to 1, and rate of a minimum-jerk motion (Flash and Hogan, 1985) at
-    `time`, 0 to 1.
+    """Return position, 0 to 1, and rate of a minimum-jerk motion at `time`, 0 to 1.
+
+    See Flash and Hogan, 1985.
     """
     x = min(max(time, 0.0), 1.0)
     return x * x * x * (10.0 - 15.0 * x + 6.0 * x * x), 30.0 * x * x * (1.0 - x) * (1.0 - x)
@@ -207,8 +210,9 @@ class PreshapeWork(StepWork):
 
 
 class CloseWork(StepWork):
-    """Moves the tips at constant speed towards points in the object until each touches it. A tip
-    that touches stays there and presses.
+    """Moves the tips at constant speed towards points in the object until each touches it.
+
+    A tip that touches stays at that place and presses.
     """
 
     step: CloseStep
@@ -266,8 +270,9 @@ class CloseWork(StepWork):
 
 
 class GrippingWork(StepWork):
-    """Base of the steps during which the fingers grip the object: they maintain the grip and detect
-    its loss.
+    """Base of the steps during which the fingers grip the object.
+
+    It maintains the grip and detects its loss.
     """
 
     def set_start(self) -> None:
@@ -312,8 +317,9 @@ class GrippingWork(StepWork):
 
 
 class SqueezeWork(GrippingWork):
-    """Raises the grip force. The object settles between the fingers, and its anchor is its position
-    at the end.
+    """Raises the grip force.
+
+    The object settles between the fingers, and its anchor is its position at the end.
     """
 
     step: SqueezeStep
@@ -334,9 +340,7 @@ class SqueezeWork(GrippingWork):
 
 
 class ShiftWork(GrippingWork):
-    """Moves the anchor of the object and the points of the tips by `step.by`, in the frame of the
-    palm.
-    """
+    """Moves the anchor of the object and the points of the tips by `step.by`, in the palm frame."""
 
     step: ShiftStep
 

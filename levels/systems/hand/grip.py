@@ -44,8 +44,9 @@ class GripGains(Table):
 
 
 class HandGrip:
-    """The grip of several fingers, one of which opposes the others. All forces are of the tips on
-    the object.
+    """The grip of several fingers, one of which opposes the others.
+
+    All forces are forces of the tips on the object.
     """
 
     def __init__(self, gains: GripGains, fingers: Mask, opposing: int, period_s: float) -> None:
@@ -89,8 +90,11 @@ class HandGrip:
             self.load *= self._gains.most_load / excess
 
     def follow_creep(self, points: Array, tips: Array) -> None:
-        """Move the `points` of the springs, (fingers, 3), m, towards the tips, all by the same
-        displacement.
+        """Move the points of the springs towards the tips, all by the same displacement.
+
+        Args:
+            points: Points of the springs, (fingers, 3), m; changed.
+            tips: Positions of the tips, (fingers, 3), m.
         """
         stiffness = self.stiffness[:, None]
         whole = float(self.stiffness.sum())
@@ -99,17 +103,16 @@ class HandGrip:
         self.load -= whole * way
 
     def find_forces(self, tips: Array) -> Array:
-        """Return the forces of the fingers, (fingers, 3), N, for tips at `tips`, (fingers, 3),
-        m.
-        """
+        """Return the forces of the fingers, (fingers, 3), N, for these tips, (fingers, 3), m."""
         return np.asarray(
             self.shares[:, None]
             * (0.5 * self.load - self.force * self.find_outward_directions(tips))
         )
 
     def find_outward_directions(self, tips: Array) -> Array:
-        """Return unit vectors from the object to each tip, (fingers, 3), zero for fingers that do
-        not grip.
+        """Return unit vectors from the object to each tip, (fingers, 3).
+
+        They are zero for fingers that do not grip.
         """
         directions = np.zeros_like(tips)
         line = tips[self._opposing] - (self.shares[:, None] * tips)[self._others].sum(axis=0)

@@ -1,5 +1,4 @@
-"""Kinematics of the fingers: tips and their Jacobians in the frame of the palm, and inverse
-kinematics.
+"""Kinematics of the fingers: tips and Jacobians in the palm's frame, and inverse kinematics.
 
 Evaluated on separate MuJoCo data, like the dynamics of an arm (`rack.levels.robot.dynamics`), so
 that results depend on the joint positions alone. The palm does not move.
@@ -56,8 +55,9 @@ class FingerKinematics:
         return transposed_mat_vec(self.rotation, point - self.palm.position)
 
     def find_jacobian(self, finger: int) -> Array:
-        """Return the Jacobian of a finger's tip with respect to the joints of the finger, (3,
-        joints of the finger), m/rad.
+        """Return the Jacobian of a finger's tip with respect to the joints of the finger.
+
+        Its shape is (3, joints of the finger), its unit m/rad.
         """
         mujoco.mj_jacSite(self._cell.model, self._data, self._whole, None, self._tips[finger])
         own = np.take(self._whole, self._cell.dof[self.joints[finger]], axis=1)
@@ -68,12 +68,12 @@ class FingerKinematics:
     def step_towards(self, finger: int, position: Array, way: Array, homing: Array) -> None:
         """Make one damped step of inverse kinematics; call `set_position(position)` before.
 
-        A finger has a redundant joint. Of all joint motions that move the tip by `way` this takes
-        the one nearest to `homing`.
+        A finger has a redundant joint. Of all joint motions that move the tip by `way`, this step
+        takes the motion nearest to `homing`.
 
         Args:
             finger: Index of the finger.
-            position: Joint positions, (joints,), rad; those of the finger are changed.
+            position: Joint positions, (joints,), rad; the finger's are changed.
             way: Displacement of the tip, (3,), m.
             homing: Preferred joint motion, (joints of the finger,), rad.
         """

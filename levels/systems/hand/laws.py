@@ -105,8 +105,13 @@ class FingertipLaw:
         self.wanted[:] = self._rest[:] = position
 
     def find_tips(self, position: Array) -> Array:
-        """Return the tips, (fingers, 3), m, of the driven fingers at sensed joint positions,
-        (joints,), rad.
+        """Return the tips of the driven fingers at sensed joint positions.
+
+        Args:
+            position: Joint positions, (joints,), rad.
+
+        Returns:
+            Positions of the tips, (fingers, 3), m.
         """
         self.kinematics.set_position(position)
         for finger in self._fingers:
@@ -150,8 +155,11 @@ class FingertipLaw:
             out.velocity[own] = moved[own] / self._period_s
 
     def _approach_points(self, fingers: Sequence[int], points: Array) -> None:
-        """Move the targets of `fingers` towards joint positions with tips at `points`, (fingers,
-        3), m.
+        """Move the targets of `fingers` towards joint positions at which their tips reach points.
+
+        Args:
+            fingers: Indices of the fingers.
+            points: Points of all fingers, (fingers, 3), m.
         """
         for _ in range(STEPS):
             self.kinematics.set_position(self.wanted)
@@ -222,17 +230,33 @@ class JointLaw:
     "f8[:,::1], f8[::1], f8[::1]"
 )
 def set_joint_torques(
-    gains: tuple[float, float],  # stiffness, 1/s2, and damping, 1/s
-    times: tuple[float, float],  # s: extrapolation of the sample, and of the target
-    constants: Array,  # (4, joints): rows as below
-    state: Array,  # (2, joints): rad, rad/s
-    wanted: Array,  # (4, joints): rad, rad/s, scale of the stiffness, N m
-    spring: Array,  # (joints, joints), N m/rad
-    inertia: Array,  # (joints, joints), kg m2
-    weight: Array,  # (joints,), N m
-    torque: Array,  # (joints,), N m: set; 0 for joints of other boards
+    gains: tuple[float, float],
+    times: tuple[float, float],
+    constants: Array,
+    state: Array,
+    wanted: Array,
+    spring: Array,
+    inertia: Array,
+    weight: Array,
+    torque: Array,
 ) -> bool:
-    """Set the torques; return whether one was limited."""
+    """Set the torques of the driven joints.
+
+    Args:
+        gains: Stiffness, 1/s2, and damping, 1/s.
+        times: Times by which the sample and the target are extrapolated, s.
+        constants: Dry friction, viscous friction, torque limit and mask of the joints, (4, joints).
+        state: Sensed positions and velocities, (2, joints).
+        wanted: Target position, target velocity, scale of the stiffness and feedforward torque, (4,
+            joints).
+        spring: Stiffness of the grip, (joints, joints), N m/rad.
+        inertia: Inertia matrix, (joints, joints), kg m2.
+        weight: Torques that compensate gravity, (joints,), N m.
+        torque: Torques, (joints,), N m; set. 0 for joints of other boards.
+
+    Returns:
+        True if a torque was limited.
+    """
     dry = constants[0]  # N m
     viscous = constants[1]  # N m s/rad
     limit = constants[2]  # N m
@@ -280,8 +304,9 @@ class TendonGains(Table):
 
 
 class TendonLaw:
-    """Computes the tensions for some joints of a hand. Corrections of valves are lost in a
-    restart and learned again.
+    """Computes the tensions for some joints of a hand.
+
+    Corrections of valves are lost in a restart and learned again.
     """
 
     def __init__(self, hand: Hand, driven: Mask, gains: TendonGains, context: LevelContext) -> None:
@@ -336,16 +361,28 @@ class TendonLaw:
     "UniTuple(f8, 4), UniTuple(f8, 2), f8[:,::1], f8[:,:,::1], f8[::1], f8[::1], f8[:,::1]"
 )
 def set_tensions(
-    # Mean tension, N; lead; response of a valve in a cycle, 0 to 1; largest trim, N.
     numbers: tuple[float, float, float, float],
-    shares: tuple[float, float],  # response since the last sample, 0 to 1: of a valve, of the trim
-    constants: Array,  # (4, joints): rows as below
-    valves: Array,  # (3, 2, joints), N: rows as below
-    sensed: Array,  # (4 * joints,), N: sensed, then commanded tensions, flexors first
-    torque: Array,  # (joints,), N m
-    tension: Array,  # (2, joints), N: set; 0 for joints of other boards
+    shares: tuple[float, float],
+    constants: Array,
+    valves: Array,
+    sensed: Array,
+    torque: Array,
+    tension: Array,
 ) -> bool:
-    """Set the tensions; return whether a torque had to be clipped."""
+    """Set the tensions of the driven joints.
+
+    Args:
+        numbers: Mean tension, N; lead; response of a valve in a cycle, 0 to 1; largest trim, N.
+        shares: Responses of a valve and of the trim since the last sample, 0 to 1.
+        constants: Lever arm, least and largest tension, and mask of the joints, (4, joints).
+        valves: Modelled tensions now and at the sample, and trim, (3, 2, joints), N; changed.
+        sensed: Sensed, then commanded tensions, flexors first, (4 * joints,), N.
+        torque: Torques, (joints,), N m.
+        tension: Tensions, (2, joints), N; set. 0 for joints of other boards.
+
+    Returns:
+        True if a torque had to be clipped.
+    """
     rest, lead, share, most_trim = numbers
     arm = constants[0]  # m
     least = constants[1]  # N

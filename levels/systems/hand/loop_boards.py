@@ -1,8 +1,8 @@
-"""Boards for the loops of a hand. A board runs one loop of all fingers, or all loops of one finger,
-with the same laws.
+"""Boards for the loops of a hand.
 
-The fingertip loop converts commands of the grasp loop to joint targets, the joint loop converts
-these to torques, and the tendon loop converts torques to tensions.
+A board runs one loop of all fingers, or all loops of one finger, with the same laws. The fingertip
+loop converts commands of the grasp loop to joint targets, the joint loop converts these to torques,
+and the tendon loop converts torques to tensions.
 """
 
 from __future__ import annotations
@@ -97,7 +97,13 @@ class HandLoop(Executor):
     def misfits(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Misfits:
-        """Yield a robot without a hand, and missing neighbours."""
+        """Yield a robot without a hand, and missing neighbours.
+
+        Args:
+            context: Context of this board.
+            above: Contexts of the boards above it.
+            below: Contexts of the boards below it.
+        """
         if context.robot.hand is None:
             yield "executor", cls.__name__, "it drives a hand, but there is no [robot.hand]"
         for place, boards in (("above", above), ("below", below)):
@@ -110,8 +116,11 @@ class HandLoop(Executor):
 
     @abstractmethod
     def follow_command(self, hand: HandStatus, tick: int) -> None:
-        """Fill the command for `self.followed`, and the fields of the status that are specific to
-        the loop.
+        """Fill the command for `self.followed`, and the status fields specific to the loop.
+
+        Args:
+            hand: Status with the newest sample.
+            tick: Release tick of this cycle.
         """
 
     def process(self, tick: int) -> None:
@@ -144,8 +153,9 @@ class HandLoop(Executor):
         )
 
     def command_age_s(self, tick: int) -> float:
-        """Return the time by which the command is extrapolated, s: its age, at most a cycle of the
-        level above.
+        """Return the time by which the command is extrapolated, s.
+
+        This is the age of the command, but at most a cycle of the level above.
         """
         return min(tick - self._taken, self._period) * self.context.tick_s
 
@@ -359,7 +369,13 @@ class FingerExecutor(HandLoop):
     def misfits(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Misfits:
-        """Yield a finger that the hand lacks, and what `HandLoop` yields."""
+        """Yield a finger that the hand lacks, and the mistakes that `HandLoop` reports.
+
+        Args:
+            context: Context of this board.
+            above: Contexts of the boards above it.
+            below: Contexts of the boards below it.
+        """
         yield from super().misfits(context, above, below)
         hand = context.robot.hand
         name = read_params(FingerParams, context.params).finger

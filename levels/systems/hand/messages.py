@@ -1,5 +1,4 @@
-"""The messages of a hand: tensions down to the valves, angles and tensions up, and the targets of
-the loops between.
+"""The messages of a hand: tensions, angles, and the targets of the loops between them.
 
 Symbolic sizes are `joints` of the hand, in the order of `robot.joints`, and `fingers`, in the order
 of `robot.hand`. Vectors have all joints or all fingers; a board that drives only some of them fills
@@ -148,9 +147,7 @@ class LoopStatus(AnsweringStatus, version=1):
 
 
 class FingerStatus(AnsweringStatus, version=1):
-    """From the fingertip loop, or from a board that runs all loops of a finger, to the grasp
-    loop.
-    """
+    """Status of a fingertip loop, or of a board with all loops of a finger, for the grasp loop."""
 
     driven: ndarray = field("u1", unit="1", doc="1 for fingers of this board", shape="fingers")
     sensed: int = SENSED
@@ -186,8 +183,10 @@ class GraspStatus(AnsweringStatus, version=1):
 
 
 class GraspPlan(RelayedCommand, version=1):
-    """From a planner, on a board or on the host side, to the grasp loop: contacts of the fingers on
-    an object, and the posture from which they close. The newest with an `id` above 0 is used.
+    """Contacts of the fingers on an object, and the posture from which they close.
+
+    It comes from a planner, on a board or on the host side, and goes to the grasp loop. The newest
+    message with an `id` above 0 is used.
     """
 
     object: int = integer("row of the object in the world model", "i2")

@@ -15,25 +15,33 @@ from rack.levels.tables import SceneConfig
 
 
 class HandSample(NamedTuple):
-    """One sample of a hand's sensors. Positions and velocities have the resolution and noise of
-    their encoders.
+    """One sample of a hand's sensors.
+
+    Positions and velocities have the resolution and noise of their encoders.
+
+    Attributes:
+        position: Joint positions, (joints,), rad.
+        velocity: Joint velocities, (joints,), rad/s.
+        torque: Torques of the tendons, (joints,), N m.
+        tension: Tensions of flexors and extensors, (2, joints), N.
+        force: Forces of the environment on the tips in the palm's frame, (fingers, 3), N.
     """
 
-    position: Array  # (joints,), rad
-    velocity: Array  # (joints,), rad/s
-    torque: Array  # (joints,), N m: torque of the tendons
-    tension: Array  # (2, joints), N: flexors, extensors
-    force: Array  # (fingers, 3), N: environment on tips, in the palm's frame
+    position: Array
+    velocity: Array
+    torque: Array
+    tension: Array
+    force: Array
 
 
 class SimulatedHand(Simulation):
-    """A hand driven by tendons. It has no brakes: without commands its valves close and keep the
-    grip.
+    """A hand driven by tendons.
 
-    The air in a closed valve acts as a spring. The tension of its tendon rises by `Hand.closed` for
-    each metre by which the joint pulls the tendon. Moving fingers therefore come to rest, and the
-    grip is kept by the tension at which the valves closed. Initially the valves are closed, with
-    tensions that carry the weight of the open hand.
+    It has no brakes: without commands its valves close and keep the grip. The air in a closed valve
+    acts as a spring. The tension of its tendon rises by `Hand.closed` for each metre by which the
+    joint pulls the tendon. Moving fingers therefore come to rest, and the grip is kept by the
+    tension at which the valves closed. Initially the valves are closed, with tensions that carry
+    the weight of the open hand.
     """
 
     def __init__(
@@ -81,14 +89,16 @@ class SimulatedHand(Simulation):
 
     @property
     def wanted(self) -> Array:
-        """Tensions commanded of open valves, or equilibrium tensions of closed ones, (2, joints),
-        N.
+        """Commanded tensions of open valves, or equilibrium tensions of closed ones.
+
+        Its shape is (2, joints), its unit N.
         """
         return np.asarray(np.clip(self._data.ctrl[self.hand.actuators], 0.0, self.hand.most))
 
     def sense(self) -> HandSample:
-        """Return the newest sample. Torques, tensions and forces are one simulation step old, as
-        always in MuJoCo.
+        """Return the newest sample.
+
+        Torques, tensions and forces are one simulation step old, as always in MuJoCo.
         """
         position, velocity = self._state
         if self._coarse is not None:
@@ -113,8 +123,9 @@ class SimulatedHand(Simulation):
         self.braked = True
 
     def step(self, ticks: int) -> None:
-        """Simulate `ticks` ticks. After a simulation fault the hand stays in its last valid state
-        while time continues.
+        """Simulate `ticks` ticks.
+
+        After a simulation fault the hand stays in its last valid state while time continues.
         """
         self.contact = None
         for _ in range(ticks):

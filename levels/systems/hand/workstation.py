@@ -212,9 +212,7 @@ class GraspPlanner:
         return bool((hand & (data.contact.dist < 0.0)).any())
 
     def _find_grip_force(self, row: int) -> float:
-        """Return the force of each finger, N, at which friction on both sides bears weight and
-        pull.
-        """
+        """Return the force per finger, N, at which friction on both sides bears weight and pull."""
         model = self._cell.model
         body = self._cell.bodies[row]
         friction = float(model.geom_friction[self._object_geoms(row), 0].max())

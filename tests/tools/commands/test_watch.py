@@ -57,7 +57,7 @@ def test_what_is_not_there_is_one_line(held: str, tmp_path: Path) -> None:
         (*never, "--out", "missing/x.csv"): '"missing/x.csv": No such file or directory',
         (*never, "--out", "."): '".": Is a directory',
         ("watch", held, "counter.status.row", "--when", "counter.status.row > nan"): (
-            '"counter.status.row > nan": nan is not a number to compare with'
+            '"counter.status.row > nan": nothing can be compared with nan'
         ),
     }
     for words, why in cases.items():

@@ -96,7 +96,7 @@ def test_the_run_that_a_branch_continues_is_found_if_it_is_the_very_run(
     rack("run", small, "--lockstep", "--seconds", SECONDS, *names)
     refused = rack(*against)
     assert (refused.returncode, refused.stderr.count("\n")) == (2, 1), refused.stderr
-    assert f"goes on from {run}, and that run is not there any more" in refused.stderr
+    assert f"continues {run}, but that run no longer exists" in refused.stderr
 
 
 @pytest.mark.slow
@@ -160,7 +160,7 @@ def test_a_run_that_continues_another_is_continued(run: Path, tmp_path: Path) ->
     run.rename(tmp_path / "elsewhere")
     refused = rack("run", "--from", f"{two}@0.6", "--no-record")
     assert (refused.returncode, refused.stderr.count("\n")) == (2, 1)
-    assert f"goes on from {run}, and that run is not there any more" in refused.stderr
+    assert f"continues {run}, but that run no longer exists" in refused.stderr
 
 
 @pytest.mark.slow
@@ -202,7 +202,7 @@ def test_a_run_of_an_older_version_is_refused_unless_it_is_wanted_anyway(
     code.unlink()
     refused = rack(*again)
     assert (refused.returncode, refused.stderr.count("\n")) == (2, 1)
-    assert "it has no code.json: 'rack record' or an older version recorded it" in refused.stderr
+    assert "it has no code.json, because 'rack record' or an older version" in refused.stderr
     done = rack(*again, "--anyway")
     assert (
         json.loads(done.stdout)["digest"] == json.loads((run / "report.json").read_text())["digest"]

@@ -1,4 +1,4 @@
-"""Displays that strike the recorder of a run, and what tests read of its recording."""
+"""Displays that disturb the recorder of a run, and helpers that read its recording."""
 
 from __future__ import annotations
 
@@ -39,8 +39,10 @@ class Keeping(Display):
 
 
 class AtTick(Display):
-    """Strikes the recorder of the run, by default with a signal, `times` times, when the run has
-    got to some tick."""
+    """Strikes the recorder `times` times after the run has reached a tick.
+
+    By default it sends a signal.
+    """
 
     period_s = 0.05
 
@@ -56,7 +58,7 @@ class AtTick(Display):
         self.struck: list[int] = []
 
     def _has_view(self) -> bool:
-        """Say whether the viewer's file, if that matters, has grown since it was begun."""
+        """Return True if the viewer's file has grown, or does not matter."""
         if self._view is None:
             return True
         size = self._view.stat().st_size if self._view.is_file() else 0
@@ -77,15 +79,18 @@ class AtTick(Display):
 
 
 class Held(AtTick):
-    """Strikes while a rack in lockstep, launched with `step`, is held at the tick: however late the
-    looks of a busy machine, the run is not over. Lets it go on once it has struck."""
+    """Strikes while a rack in lockstep, launched with `step`, is held at the tick.
+
+    The run cannot end before the strike, however late a busy machine lets the display look.
+    Afterwards the rack continues.
+    """
 
     def __init__(self, rack: str, number: signal.Signals, tick: int = FIRST_BLOCK, times: int = 1):
         super().__init__(number, -1, times=times)
         self._rack, self._hold_at = rack, tick + 1
 
     def show(self, snapshot: Snapshot) -> None:
-        """Let it run to the tick; strike there."""
+        """Let the rack run to the tick, and strike there."""
         with closing(Segment.attach(self._rack)) as segment:
             if segment.words[System.HELD] == self._hold_at:
                 super().show(snapshot)
@@ -94,8 +99,7 @@ class Held(AtTick):
 
 
 class FillingDisk(AtTick):
-    """Lets no file of the recorder grow beyond some bytes, from some tick on: to it the disk is
-    full."""
+    """Limits the size of the recorder's files from some tick on, as if the disk were full."""
 
     def __init__(self) -> None:
         super().__init__(signal.SIGKILL)
@@ -122,8 +126,7 @@ def realtime(config: RackConfig) -> RackConfig:
 
 
 class EndingView:
-    """A view whose library ends the recorder's process as it is closed, as one without memory
-    may."""
+    """A view whose library ends the recorder's process when it is closed, as if memory ran out."""
 
     def __init__(self, segment: Segment, folder: Path, port: int | None) -> None:
         pass

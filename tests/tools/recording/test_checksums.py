@@ -1,5 +1,7 @@
-"""Damage to the files of a run: no flipped bit is read as another value, and nothing but regular
-files is opened."""
+"""Damage to the files of a run: no flipped bit is read as another value.
+
+Only regular files are opened.
+"""
 
 from __future__ import annotations
 
@@ -55,7 +57,7 @@ def config(small: Path, rack_name: str) -> RackConfig:
 
 @contextmanager
 def bounded() -> Iterator[None]:
-    """Fail what hangs."""
+    """Fail if the test hangs."""
 
     def give_up(number: int, frame: object) -> None:
         raise TimeoutError(f"hangs for {BOUND_S} s")
@@ -69,7 +71,7 @@ def bounded() -> Iterator[None]:
         signal.signal(signal.SIGALRM, before)
 
 
-def values(folder: Path) -> object:
+def read_values(folder: Path) -> object:
     """Return everything that a recording says."""
     found = Recording(folder)
     signals = {
@@ -81,18 +83,20 @@ def values(folder: Path) -> object:
     return repr((found.config, cycles, signals, found.events, found.lost, found.kept, found.layout))
 
 
-def failure_of(folder: Path) -> str:
-    """Return why a run is refused, empty if it is not."""
+def find_failure(folder: Path) -> str:
+    """Return why a run is refused, or "" if it is not."""
     try:
-        values(folder)
+        read_values(folder)
     except Failure as failure:
         return str(failure)
     return ""
 
 
 def flipped_bits(folder: Path, pattern: str, flips: int) -> Iterator[tuple[Path, bytes]]:
-    """Yield files with the same file after one of its bits was flipped, the bit drawn from all
-    bits of all files."""
+    """Yield files, each after one of its bits was flipped.
+
+    The bits are drawn from all bits of all matching files.
+    """
     files = sorted(path for path in folder.glob(pattern) if path.is_file())
     sizes = [path.stat().st_size for path in files]
     draw = random.Random(41)
@@ -107,18 +111,18 @@ def flipped_bits(folder: Path, pattern: str, flips: int) -> Iterator[tuple[Path,
     "pattern", [SIGNALS, "cycles.parquet", "events.jsonl", CONFIG, CHECKSUMS, "report.*"]
 )
 def test_a_flipped_bit_is_named_or_changes_no_value(damaged: Path, pattern: str) -> None:
-    whole = values(damaged)
+    whole = read_values(damaged)
     report = rack("report", damaged, "--json").stdout
     for path, content in flipped_bits(damaged, pattern, FLIPS):
         before = path.read_bytes()
         path.write_bytes(content)
-        why = failure_of(damaged)
+        why = find_failure(damaged)
         if why:
-            # A damaged checksum is taken for a damaged file; the line names both.
+            # A damaged checksum looks like a damaged file; the line names both.
             assert str(path.relative_to(damaged)) in why
             assert len(why.splitlines()) == 1
         else:
-            assert values(damaged) == whole
+            assert read_values(damaged) == whole
             assert pattern in (CHECKSUMS, "report.*")
             assert rack("report", damaged, "--json").stdout == report
         path.write_bytes(before)
@@ -130,7 +134,7 @@ def test_a_flipped_bit_is_named_or_changes_no_value(damaged: Path, pattern: str)
     [("", SPOOL, r"recorder\.spool: "), ('record={ keep = "60 s" }', "stretches/*", "stretches/")],
     ids=["killed", "flight"],
 )
-def test_a_flipped_bit_in_what_a_recorder_leaves_is_named(
+def test_a_flipped_bit_in_the_files_of_a_killed_recorder_is_named(
     small: Path, rack_name: str, tmp_path: Path, record: str, pattern: str, why: str
 ) -> None:
     config = load(small, [f"name={rack_name}", *([record] if record else [])])
@@ -141,7 +145,7 @@ def test_a_flipped_bit_in_what_a_recorder_leaves_is_named(
         running.run(0.5)
         recorder.drain()
         recorder._spool.flush(now=True)
-        # As one that is killed leaves it.
+        # Leave the spool as a killed recorder would.
         shutil.copytree(folder, copy)
     assert [*copy.glob(pattern)]
     for path, content in flipped_bits(copy, pattern, FLIPS):
@@ -150,10 +154,10 @@ def test_a_flipped_bit_in_what_a_recorder_leaves_is_named(
         with pytest.raises(Failure, match=why):
             Recording(again)
         shutil.rmtree(again)
-    assert values(copy)
+    assert read_values(copy)
 
 
-def test_a_value_that_is_not_a_number_is_null_in_json_and_comes_back() -> None:
+def test_nan_is_null_in_json_and_is_restored() -> None:
     line = checked_line({"kind": "detection", "value": float("nan")})
     assert json.loads(line, parse_constant=pytest.fail)["value"] is None
     assert np.isnan(read_line(line)["value"])
@@ -175,7 +179,7 @@ def test_nan_in_a_sensor_leaves_strict_json(tmp_path: Path, rack_name: str) -> N
     (event,) = [one for one in found if one.get("code") == "sensor_range"]
     assert event["value"] is None
     assert "nan" in event["text"]
-    # As a program reads it, the number is there again.
+    # Programs that read the line get NaN again.
     (event,) = [
         one for one in Recording(tmp_path / "run").events if one.get("value") != one.get("value")
     ]
@@ -216,7 +220,7 @@ CASES = [
 def test_every_command_on_a_run_refuses_a_fifo_or_a_device_for_a_file(
     damaged: Path, tmp_path: Path, command: str, name: str
 ) -> None:
-    # Otherwise the report that is there is right.
+    # Without this, the stored report would be up to date.
     (damaged / "report.json").unlink()
     for take_place in PLACES:
         (damaged / name).unlink(missing_ok=True)
@@ -230,7 +234,7 @@ def test_every_command_on_a_run_refuses_a_fifo_or_a_device_for_a_file(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["report.json", "report.md"])
-def test_a_report_replaces_its_own_files_whatever_they_are(damaged: Path, name: str) -> None:
+def test_a_report_replaces_its_files_whatever_their_type(damaged: Path, name: str) -> None:
     whole = rack("report", damaged).stdout
     for take_place in PLACES:
         (damaged / name).unlink()

@@ -1,5 +1,4 @@
-"""What the machine did to its cores: time that the hypervisor took, misses meanwhile, and the
-processor's frequency."""
+"""Measurements of the cores during a run: steal, misses meanwhile, and frequencies."""
 
 from __future__ import annotations
 
@@ -43,7 +42,7 @@ def steal(machine: Path, first: int, second: int) -> None:
     (machine / "stat").write_text(text)
 
 
-def test_a_rise_is_found_with_its_core_and_the_looks_around_it(machine: Path) -> None:
+def test_a_rise_of_steal_is_recorded_with_its_core_and_time_span(machine: Path) -> None:
     found = CoreMeter()
     found.look()
     assert found.record().stolen == ()
@@ -58,7 +57,7 @@ def test_a_rise_is_found_with_its_core_and_the_looks_around_it(machine: Path) ->
     assert CoreRecord.of(record.text()) == record
 
 
-def test_frequencies_are_those_of_cpuinfo_without_cpufreq(machine: Path) -> None:
+def test_frequencies_come_from_cpuinfo_without_cpufreq(machine: Path) -> None:
     found = CoreMeter()
     for mhz in ("2600.000", "1200.5"):
         (machine / "cpuinfo").write_text(
@@ -66,7 +65,7 @@ def test_frequencies_are_those_of_cpuinfo_without_cpufreq(machine: Path) -> None
         )
         found.look()
     assert found.record().mhz == ((0, 1200.5, 2600.0), (1, 900.0, 900.0))
-    # A core of its own file; another is switched off.
+    # One core has a frequency file, another core is offline.
     for core, text in ((0, "3100000\n"), (1, "")):
         path = machine / f"cpu{core}" / "cpufreq" / "scaling_cur_freq"
         path.parent.mkdir(parents=True)
@@ -76,8 +75,7 @@ def test_frequencies_are_those_of_cpuinfo_without_cpufreq(machine: Path) -> None
 
 
 def run(folder: Path, config: Path, record: CoreRecord) -> Recording:
-    """Return a recording in real time with three misses, and what the machine did to its cores
-    meanwhile."""
+    """Return a recording in real time with three misses and this record of the cores."""
     late = [Cycle(tick, (0.1, 0.1, 2.6, 0.1), flags=int(Flag.MISSED)) for tick in (10, 20, 30)]
     found = recorded(
         folder, load(config, ["clock.mode=realtime", "board.lower.core=1"]), {"lower": late}
@@ -86,7 +84,7 @@ def run(folder: Path, config: Path, record: CoreRecord) -> Recording:
     return found
 
 
-def test_misses_are_told_apart_by_core_and_time(small: Path, tmp_path: Path) -> None:
+def test_misses_during_steal_are_counted_by_core_and_time(small: Path, tmp_path: Path) -> None:
     empty = run(tmp_path / "run", small, UNMEASURED)
     period_ns, core = empty.layout.clock_ns, empty.layout.task("lower").core
     during = Stolen(20 * period_ns - MS, 20 * period_ns + MS, core, 10)
@@ -101,7 +99,7 @@ def test_misses_are_told_apart_by_core_and_time(small: Path, tmp_path: Path) -> 
     }
     assert (report["stalls"]["lost"], report["stalls"]["during_steal"]) == (3, 1)
     taken = f"core {core} for 0.20 %, core {core + 1} for 0.60 % of the run"
-    line = f"- the hypervisor took {taken} (steal); 1 of 3 lost cycles were due meanwhile"
+    line = f"- the hypervisor took {taken} (steal); 1 of 3 lost cycles were due at these times"
     assert line in markdown(report)
 
 

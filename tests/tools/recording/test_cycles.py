@@ -1,5 +1,4 @@
-"""Measured budgets: what levels took of a processor, on made-up traces and on racks that compute
-for known times."""
+"""Measured budgets, on synthetic traces and on racks that compute for known times."""
 
 from __future__ import annotations
 
@@ -33,7 +32,7 @@ def config(small: Path) -> RackConfig:
     return load(small, settings)
 
 
-def test_cycles_that_nobody_disturbed_are_as_they_were_stamped(
+def test_undisturbed_cycles_have_the_times_of_their_stamps(
     config: RackConfig, tmp_path: Path
 ) -> None:
     trace = [
@@ -48,21 +47,19 @@ def test_cycles_that_nobody_disturbed_are_as_they_were_stamped(
     }
 
 
-def test_what_an_executor_preempted_is_not_its_planners_time(
-    config: RackConfig, tmp_path: Path
-) -> None:
+def test_preemption_by_the_executor_is_not_planner_time(config: RackConfig, tmp_path: Path) -> None:
     executor = [Cycle(SETTLED + k, PLAIN) for k in range(4)]
     # Released with the executor's first cycle: 1.3 ms pass before it runs, 1.3 ms each in P and in
     # U.
     plan = Cycle(SETTLED, (0.0, 0.1, 3.1, 2.6), late=1.4, processor=3.2, flags=PLANNED)
     recording = recorded(tmp_path / "run", config, {"lower": executor, "lower.planner": [plan]})
     found = measured_budgets(recording)["lower"]
-    # Its reading is part of P. U began at 6 ms and was preempted from 7.5 ms on.
+    # Reading is part of P. U began at 6 ms and was preempted from 7.5 ms on.
     assert found.plan_ns == round((0.1 + 1.8) * MS)
     assert found.update_ns == round(1.3 * MS)
 
 
-def test_time_lost_to_what_left_no_trace_is_taken_off_what_is_longer_than_usual(
+def test_untraced_time_is_subtracted_from_unusually_long_parts(
     config: RackConfig, tmp_path: Path
 ) -> None:
     usual = [Cycle(SETTLED + k, PLAIN) for k in range(10)]
@@ -73,7 +70,7 @@ def test_time_lost_to_what_left_no_trace_is_taken_off_what_is_longer_than_usual(
     assert (found.process_ns, found.write_ns) == (MS, MS // 5)
 
 
-def test_a_process_that_starts_up_is_not_counted(config: RackConfig, tmp_path: Path) -> None:
+def test_the_start_up_of_a_process_is_not_counted(config: RackConfig, tmp_path: Path) -> None:
     cold = (0.0, 0.1, 2.2, 0.2)
     ticks = [*range(60), *range(80, 140)]
     trace = [Cycle(tick, cold if tick in (0, 39, 80, 119) else PLAIN) for tick in ticks]
@@ -104,8 +101,10 @@ def test_a_recording_without_the_new_times_is_refused_in_one_line(
 
 
 @pytest.fixture(scope="module")
-def figure(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Recording:
-    """A run of fig2, in the mode that is the fixture's parameter, with an executor of 1 ms."""
+def measured_run(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Recording:
+    """A run of fig2 with an executor of 1 ms, in the mode that the fixture's parameter names."""
     folder = tmp_path_factory.mktemp("figure") / "run"
     settings = [
         f"name=test-cycles-{os.getpid()}",
@@ -117,12 +116,12 @@ def figure(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("figure", ["realtime", "lockstep"], indirect=True)
-def test_a_level_that_computes_for_known_times_is_measured_to_have_taken_them(
-    figure: Recording,
+@pytest.mark.parametrize("measured_run", ["realtime", "lockstep"], indirect=True)
+def test_measured_times_match_known_computing_times(
+    measured_run: Recording,
 ) -> None:
-    # The median of all cycles: a host that takes the machine away must not fail this test.
-    found = measured_budgets(figure, 50.0)["level"]
+    # Use the median, so that a host that takes the machine away does not fail this test.
+    found = measured_budgets(measured_run, 50.0)["level"]
     expected = {
         "read_ns": 1.0,
         "process_ns": 1.0,
@@ -130,7 +129,7 @@ def test_a_level_that_computes_for_known_times_is_measured_to_have_taken_them(
         "plan_ns": 6.0,
         "update_ns": 1.0,
     }
-    # Each access and each look at the clock takes some time more than asked for.
+    # Each access and each reading of the clock adds some time.
     assert {name: getattr(found, name) / MS for name in expected} == pytest.approx(
         expected, rel=0.08, abs=0.15
     )

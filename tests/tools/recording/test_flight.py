@@ -1,5 +1,7 @@
-"""The flight recorder: a bounded folder, in which the last stretch and what surrounds an occasion
-stay, and every row that had to be kept is proved to be there."""
+"""The flight recorder: its folder stays small, and all required rows are kept.
+
+Required are the last stretch and the time around each occasion.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +49,7 @@ LEEWAY = 4
 """Stretches that are not whole seconds, and those at the borders."""
 
 
-class Measuring(Display):
+class StretchCounter(Display):
     """Counts the stretches in a folder, second by second."""
 
     period_s = 0.05
@@ -69,23 +71,23 @@ def config(small: Path, rack_name: str) -> RackConfig:
 
 
 @pytest.fixture(scope="module")
-def long_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunResult, Measuring]:
-    """A run of a minute: its result, and how many stretches there were meanwhile."""
+def long_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunResult, StretchCounter]:
+    """A run of one minute: its result, and the number of stretches in each second."""
     folder = tmp_path_factory.mktemp("flight")
     (folder / "small.toml").write_text(SMALL)
     config = load(folder / "small.toml", [f"name=test-flight-{os.getpid()}", RECORD, FAULT])
-    display = Measuring(folder / "run")
+    display = StretchCounter(folder / "run")
     return run_rack(config, LONG_S, folder / "run", display), display
 
 
-def test_a_long_run_does_not_grow_and_what_surrounds_a_fault_stays(
-    long_run: tuple[RunResult, Measuring],
+def test_a_long_run_does_not_grow_and_keeps_the_time_around_a_fault(
+    long_run: tuple[RunResult, StretchCounter],
 ) -> None:
     result, display = long_run
     folder = display.folder
     assert (result.worked, result.recording) == (True, "complete")
     late = {second: count for second, count in display.counts.items() if second > 2 * KEEP_S}
-    # The fault's end and the message that was missed by its reader are occasions, too.
+    # The end of the fault, and the miss that its reader detected, are occasions as well.
     assert max(late.values()) <= KEEP_S + 2 * AROUND_S + 1 + LEEWAY
     assert max(late.values(), default=0) > KEEP_S - LEEWAY
     recording = Recording(folder)
@@ -103,8 +105,8 @@ def test_a_long_run_does_not_grow_and_what_surrounds_a_fault_stays(
     assert recording.gaps() == []
 
 
-def test_what_is_removed_is_neither_lost_nor_a_gap_and_all_say_so(
-    long_run: tuple[RunResult, Measuring], tmp_path: Path
+def test_removed_stretches_count_neither_as_lost_nor_as_gaps(
+    long_run: tuple[RunResult, StretchCounter], tmp_path: Path
 ) -> None:
     folder, made = long_run[1].folder, tmp_path / "made.rrd"
     report, text = write_report(folder)
@@ -114,7 +116,7 @@ def test_what_is_removed_is_neither_lost_nor_a_gap_and_all_say_so(
     assert report["kept"] == recording.kept_text
     assert f"- {recording.kept_text}\n" in text
     assert (report["rows_lost"], report["gaps"], report["untraced"]) == ({}, [], {})
-    # No plan was as old as the stretch that is missing.
+    # Ages must not span the removed stretch.
     assert report["tasks"]["lower"]["plan_age_ms"]["max"] < 100
     with pytest.raises(Failure, match=r"the rest was not kept.*cannot be compared"):
         first_difference(recording, recording)
@@ -122,7 +124,7 @@ def test_what_is_removed_is_neither_lost_nor_a_gap_and_all_say_so(
     replay([folder], made, against=None)
     shown = read(made, "/signals/lower.status/count")
     assert shown.ticks.tolist() == recording.signal("lower.status", "tick").tolist()
-    # No age is shown where nothing was kept.
+    # The viewer must not show an age where nothing was kept.
     ages = read(made, "/ages/lower.status").ticks
     assert len(ages)
     (_, gone), (back, _) = recording.kept
@@ -131,7 +133,7 @@ def test_what_is_removed_is_neither_lost_nor_a_gap_and_all_say_so(
     assert recording.kept_text in str([chunk.to_record_batch().to_pydict() for chunk in logged])
 
 
-def test_a_recorder_that_is_killed_goes_on_with_the_next_stretch(
+def test_a_restarted_flight_recorder_continues_with_the_next_stretch(
     config: RackConfig, tmp_path: Path
 ) -> None:
     display = Held(config.name, signal.SIGKILL, tick=25 * SECOND)
@@ -140,13 +142,13 @@ def test_a_recorder_that_is_killed_goes_on_with_the_next_stretch(
     assert (result.worked, result.recording) == (True, "complete")
     recording = Recording(tmp_path / "run")
     ticks = recording.trace("lower")["tick"]
-    # What the first one had not removed stays.
+    # Stretches that the first recorder had not removed are kept.
     assert np.isin(np.arange((FAULT_S - AROUND_S) * SECOND, 25 * SECOND), ticks).all()
     assert not any(recording.lost.values())
 
 
-def fly(rack: Rack, folder: Path, seconds: float) -> Recorder:
-    """Run a rack, and record it in this process; return the recorder, to be closed."""
+def record_flight(rack: Rack, folder: Path, seconds: float) -> Recorder:
+    """Run a rack and record it in this process. Returns the recorder, which is still open."""
     folder.mkdir()
     (folder / CONFIG).write_text(rack.config.text())
     recorder = Recorder(rack.segment, folder)
@@ -157,8 +159,8 @@ def fly(rack: Rack, folder: Path, seconds: float) -> Recorder:
     return recorder
 
 
-def what_lacks(segment: Segment, folder: Path) -> tuple[set[str], list[tuple[int, int]]]:
-    """Return the rings of which rows lack, and the ticks that had to be kept and are not there."""
+def find_missing_rows(segment: Segment, folder: Path) -> tuple[set[str], list[tuple[int, int]]]:
+    """Return the rings with missing rows, and the required ticks that were not kept."""
     left, keeping = tally(folder), Retention.of(segment)
     assert left is not None
     assert keeping is not None
@@ -166,7 +168,7 @@ def what_lacks(segment: Segment, folder: Path) -> tuple[set[str], list[tuple[int
     return {*find_missing(segment, left.taken, left.lost)}, [tuple(ends) for ends in absent]
 
 
-def test_a_recording_is_complete_only_if_all_that_had_to_be_kept_is_there(
+def test_a_recording_is_complete_only_if_every_required_tick_is_kept(
     config: RackConfig, tmp_path: Path
 ) -> None:
     early = config.model_copy(
@@ -178,33 +180,33 @@ def test_a_recording_is_complete_only_if_all_that_had_to_be_kept_is_there(
         nothing = tmp_path / "nothing"
         nothing.mkdir()
         Recorder(segment, nothing).close()
-        fly(rack, folder, seconds=10.0).close()
-        assert what_lacks(segment, folder) == (set(), [])
+        record_flight(rack, folder, seconds=10.0).close()
+        assert find_missing_rows(segment, folder) == (set(), [])
         stretches = sorted((folder / STRETCHES).iterdir())
-        # The last two may hold no rows: they begin when the run ends.
+        # The last two stretches begin when the run ends, and may hold no rows.
         around, last = stretches[1], stretches[-3]
         for path in (around, last):
             whole = path.read_bytes()
             path.unlink()
-            lacking, absent = what_lacks(segment, folder)
-            # A file that is gone is not damage of another: it counts as removed, which it must not.
+            lacking, absent = find_missing_rows(segment, folder)
+            # A deleted stretch is no damage, but it counts as removed although it was required.
             assert not lacking
             assert absent
             path.write_bytes(whole)
         whole = last.read_bytes()
         last.write_bytes(whole[: len(whole) * 2 // 3])
-        lacking, absent = what_lacks(segment, folder)
+        lacking, absent = find_missing_rows(segment, folder)
         assert lacking
         assert not absent
-        lacking, absent = what_lacks(segment, nothing)
+        lacking, absent = find_missing_rows(segment, nothing)
     assert {"lower", "lower.status", "upper"} <= lacking
     assert absent
 
 
-def test_what_is_kept_is_saved_while_the_run_goes_on(config: RackConfig, tmp_path: Path) -> None:
+def test_kept_stretches_can_be_saved_during_the_run(config: RackConfig, tmp_path: Path) -> None:
     run, saved = tmp_path / "run", tmp_path / "saved"
     with Rack(config) as rack:
-        recorder = fly(rack, run, seconds=6.0)
+        recorder = record_flight(rack, run, seconds=6.0)
         left = sorted(path.name for path in (run / STRETCHES).iterdir())
         save_run(run, saved)
         recorder.close()

@@ -1,5 +1,4 @@
-"""A disk that is full, or a folder that cannot be written: the user gets a message, and no run
-hangs."""
+"""A full disk or an unwritable folder: the user gets a message, and no run hangs."""
 
 from __future__ import annotations
 
@@ -73,7 +72,7 @@ def test_a_full_disk_ends_the_run_within_seconds_and_names_the_folder(
     config: RackConfig, tmp_path: Path, mode: str
 ) -> None:
     display = FillingDisk()
-    # Python's own helpers of earlier tests stay until the end.
+    # Helper processes of Python from earlier tests stay until the end.
     before = set(children_of(os.getpid()))
     wanted = config if mode == "lockstep" else realtime(config)
     with pytest.raises(Failure) as caught:

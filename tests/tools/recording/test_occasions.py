@@ -1,4 +1,4 @@
-"""Which occasions a flight recorder keeps for good, and which it does not."""
+"""The occasions around which a flight recorder keeps everything."""
 
 from __future__ import annotations
 
@@ -18,30 +18,28 @@ from rack.tools.recording.spool import rings
 pytestmark = [pytest.mark.slow, pytest.mark.thorough]
 
 
-def traced(flags: list[int]) -> np.ndarray:
-    """Return records of a task, ticks 100 and so on, by their flags."""
+def build_trace(flags: list[int]) -> np.ndarray:
+    """Return trace records with these flags, from tick 100 on."""
     rows = np.zeros(len(flags), RECORD)
     rows["tick"] = 100 + np.arange(len(flags))
     rows["flags"] = flags
     return rows
 
 
-def test_misses_holds_and_all_alarms_but_commands_are_occasions(
-    small: Path, rack_name: str
-) -> None:
+def test_misses_holds_and_alarms_except_commands_are_occasions(small: Path, rack_name: str) -> None:
     record = "record={ keep = '10 s', before = '1 s', after = '2 s' }"
     with Rack(load(small, [f"name={rack_name}", record])) as rack:
         segment = rack.segment
         occasions = Occasions(segment)
         assert list(occasions.alarms()) == []
-        assert list(occasions.within("lower", traced([0, 0]))) == []
-        missed = traced([0, Flag.MISSED, 0, 1 << SKIPPED_SHIFT])
+        assert list(occasions.within("lower", build_trace([0, 0]))) == []
+        missed = build_trace([0, Flag.MISSED, 0, 1 << SKIPPED_SHIFT])
         assert list(occasions.within("lower", missed)) == [101, 103]
         rack.run(0.1)
         status = rings(segment)["lower.status"].drain().rows.copy()
         status["message"]["state"] = State.EXECUTING
         assert list(occasions.within("lower.status", status)) == []
-        # It begins, lasts over the end of what was drained, and ends.
+        # A hold begins, lasts beyond the end of the drained rows, and ends.
         status["message"]["state"][-3:] = State.HOLDING
         assert list(occasions.within("lower.status", status)) == [int(status["tick"][-3])]
         status["message"]["state"][:2] = State.HOLDING

@@ -1,5 +1,4 @@
-"""The recorder: everything that was written, in order, and no trace of itself in what was
-written."""
+"""The recorder takes everything that was written, in order, without influence on the run."""
 
 from __future__ import annotations
 
@@ -56,7 +55,7 @@ def test_recording_changes_nothing_in_a_run(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("is_same_namespace", [True, False])
-def test_lockstep_waits_for_no_recorder_of_another_pid_namespace(
+def test_lockstep_does_not_wait_for_a_recorder_in_another_pid_namespace(
     small: Path, rack_name: str, tmp_path: Path, is_same_namespace: bool
 ) -> None:
     with Rack(load(small, [f"name={rack_name}"])) as rack:

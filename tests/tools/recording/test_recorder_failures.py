@@ -1,5 +1,7 @@
-"""Recorders that are killed, stopped or late: the run continues, what was written stays readable,
-and the user gets a message."""
+"""Recorders that are killed, stopped or late.
+
+The run continues, recorded rows stay readable, and the user gets a message.
+"""
 
 from __future__ import annotations
 
@@ -49,7 +51,7 @@ def config(small: Path, rack_name: str) -> RackConfig:
 
 
 @pytest.mark.slow
-def test_a_recorder_that_is_killed_is_restarted_and_goes_on_where_it_was(
+def test_a_killed_recorder_is_restarted_and_continues_where_it_stopped(
     config: RackConfig, tmp_path: Path
 ) -> None:
     display = Held(config.name, signal.SIGKILL)
@@ -59,39 +61,39 @@ def test_a_recorder_that_is_killed_is_restarted_and_goes_on_where_it_was(
     recording = Recording(tmp_path / "run")
     restarted = "the recorder ended with status -9; restarted, 1 of at most 3 times"
     assert notes_of(recording)[0] == restarted
-    # In lockstep the clock waits for the next one as it did for the first: not one row is missing.
+    # In lockstep the clock waits for the next recorder as for the first, so no row is missing.
     serials = recording.signal("lower.status", "serial")
     assert np.array_equal(serials, np.arange(1, result.outcome.ticks + 1))
     assert not any(recording.lost.values())
     whole = run_rack(config, LONG_S, tmp_path / "whole", Display())
     assert result.outcome.digest == whole.outcome.digest
     assert counts(recording) == counts(Recording(tmp_path / "whole"))
-    # The viewer's file is not written over.
+    # The viewer's file is not overwritten.
     assert {"run.rrd", "run-2.rrd"} < {path.name for path in (tmp_path / "run").iterdir()}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", ["lockstep", "realtime"])
-def test_a_recorder_that_is_stopped_is_replaced_without_a_loss(
+def test_a_stopped_recorder_is_replaced_without_losing_rows(
     config: RackConfig, tmp_path: Path, mode: str
 ) -> None:
     display: AtTick = Held(config.name, signal.SIGSTOP)
     if mode == "realtime":
-        # The rings hold two seconds: the whole run.
+        # The rings hold two seconds, which is the whole run.
         display, config = AtTick(signal.SIGSTOP), realtime(config)
     seconds = LONG_S if mode == "lockstep" else 2.0
     result = run_rack(config, seconds, tmp_path / "run", display, step=mode == "lockstep")
     assert display.struck
     assert (result.worked, result.recording) == (True, "complete")
     recording = Recording(tmp_path / "run")
-    assert notes_of(recording)[0] == "the recorder is not responding: killed"
+    assert notes_of(recording)[0] == "the recorder did not respond and was killed"
     rows = len(recording.signal("lower.status", "serial"))
     assert rows == result.outcome.ticks or mode == "realtime"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", ["lockstep", "realtime"])
-def test_lockstep_waits_for_a_recorder_that_comes_late_and_real_time_does_not(
+def test_lockstep_waits_for_a_late_recorder_and_real_time_does_not(
     config: RackConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: str
 ) -> None:
     monkeypatch.setattr(recorder_process, "ATTACH_S", 0.0)
@@ -109,12 +111,12 @@ def test_lockstep_waits_for_a_recorder_that_comes_late_and_real_time_does_not(
     [
         ("kind = 'drop', at = 0.4, for = '0.4s'", "lower"),
         ("kind = 'masquerade', at = 0.4", "lower"),
-        # In each cycle as many messages as the ring of a slow task holds in a second.
+        # Each cycle sends as many messages as the ring of a slow task holds for a second.
         ("kind = 'babble', at = 0.4, for = '1s', writes = 25", "upper"),
     ],
     ids=["drop", "masquerade", "babble"],
 )
-def test_no_message_is_missing_or_taken_twice_though_some_are_faulty_and_a_recorder_is_killed(
+def test_no_message_is_missing_or_repeated_despite_damage_and_a_killed_recorder(
     small: Path, rack_name: str, fault: str, board: str
 ) -> None:
     faults = f"fault=[{{ {fault}, board = '{board}' }}]"
@@ -129,7 +131,7 @@ def test_no_message_is_missing_or_taken_twice_though_some_are_faulty_and_a_recor
 
 
 @pytest.mark.slow
-def test_a_run_whose_recorder_is_killed_too_often_has_not_worked_and_says_what_is_missing(
+def test_a_run_whose_recorder_dies_too_often_fails_and_reports_missing_rows(
     config: RackConfig, tmp_path: Path
 ) -> None:
     display = Held(config.name, signal.SIGKILL, times=recorder_process.RESTARTS + 1)
@@ -144,7 +146,7 @@ def test_a_run_whose_recorder_is_killed_too_often_has_not_worked_and_says_what_i
     assert missing.items() <= recording.lost.items()
     worst = max(result.rows_lost, key=lambda name: (result.rows_lost[name], name))
     (gap,) = recording.gaps()
-    # Slow rings lack what came since their last message.
+    # Slow rings lack the rows after their last message.
     assert (gap.first <= taken["lower"], gap.last) == (True, ticks - 1)
     assert set(gap.rings) == set(result.rows_lost)
     others = f"and rows of {len(result.rows_lost) - 1} more tasks and mailboxes"
@@ -161,7 +163,7 @@ def test_a_run_whose_recorder_is_killed_too_often_has_not_worked_and_says_what_i
 
 
 @pytest.mark.slow
-def test_a_recorder_that_dies_over_the_viewers_file_is_reported(
+def test_a_recorder_that_dies_while_writing_the_viewers_file_is_reported(
     config: RackConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
@@ -178,14 +180,14 @@ def test_a_recorder_that_dies_over_the_viewers_file_is_reported(
 @pytest.mark.slow
 def test_two_recorders_do_not_write_into_one_folder(config: RackConfig, tmp_path: Path) -> None:
     with Rack(config) as rack, Recorder(rack.segment, tmp_path):
-        with pytest.raises(Failure, match="another recorder is running there"):
+        with pytest.raises(Failure, match="another recorder is still writing it"):
             Recorder(rack.segment, tmp_path)
-        with pytest.raises(Failure, match="another recorder is running there"):
+        with pytest.raises(Failure, match="another recorder is still writing it"):
             mend(tmp_path)
 
 
 @pytest.mark.slow
-def test_a_run_is_opened_once_the_recorder_of_a_launcher_that_was_killed_has_finished(
+def test_opening_a_run_waits_for_the_recorder_of_a_killed_launcher(
     config: RackConfig, tmp_path: Path
 ) -> None:
     (tmp_path / CONFIG).write_text(config.text())
@@ -201,9 +203,7 @@ def test_a_run_is_opened_once_the_recorder_of_a_launcher_that_was_killed_has_fin
     assert not (tmp_path / SPOOL).exists()
 
 
-def test_a_spool_that_is_cut_anywhere_gives_what_is_whole(
-    config: RackConfig, tmp_path: Path
-) -> None:
+def test_a_truncated_spool_yields_all_complete_lines(config: RackConfig, tmp_path: Path) -> None:
     with Rack(config) as rack, Recorder(rack.segment, tmp_path) as recorder:
         rack.run(0.5)
         recorder.drain()
@@ -220,10 +220,10 @@ def test_a_spool_that_is_cut_anywhere_gives_what_is_whole(
     assert found[0] > 200 > found[-1]
 
 
-def test_a_spool_is_locked_until_the_files_made_of_it_are_in_place(
+def test_a_spool_is_locked_until_the_files_built_from_it_are_in_place(
     config: RackConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Otherwise two programs that open the run of a killed recorder at once damage it."""
+    """Without the lock, two programs that open a killed recorder's run at once would damage it."""
     with Rack(config) as rack:
         Recorder(rack.segment, tmp_path)._spool.close()
     refused = []
@@ -237,7 +237,7 @@ def test_a_spool_is_locked_until_the_files_made_of_it_are_in_place(
     assert refused == [True]
 
 
-def test_a_gap_stays_where_it_was_after_the_recorder_is_gone(
+def test_a_gap_keeps_its_position_when_files_are_rebuilt(
     config: RackConfig, tmp_path: Path
 ) -> None:
     (tmp_path / CONFIG).write_text(config.text())
@@ -246,7 +246,7 @@ def test_a_gap_stays_where_it_was_after_the_recorder_is_gone(
     spool = Spool(tmp_path, wire(config), Launch(*range(1, 1 + len(Launch._fields))))
     spool.add("lower", rows[:100], 0)
     spool.flush(now=True)
-    # Two drains that one flush writes, with rows lost between them.
+    # One flush writes two drains, with rows lost between them.
     spool.add("lower", rows[100:120], 0)
     spool.add("lower", rows[220:], 100)
     spool.flush(now=True)

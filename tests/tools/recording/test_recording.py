@@ -1,5 +1,7 @@
-"""Folders of runs that are damaged: one line names the file and what is wrong; what can be read is
-read."""
+"""Damaged folders of runs: one line names the file and the damage.
+
+Undamaged parts can still be read.
+"""
 
 from __future__ import annotations
 
@@ -48,8 +50,8 @@ def damaged(run: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(run, tmp_path / "run"))
 
 
-def refused(folder: Path, name: str) -> None:
-    """Have every reader refuse the folder with one line that names the file."""
+def assert_refused(folder: Path, name: str) -> None:
+    """Check that every reader refuses the folder with one line that names the file."""
     for reader in READERS:
         with pytest.raises(Failure, match=name.replace(".", r"\.")) as caught:
             reader(folder)
@@ -62,28 +64,28 @@ def refused(folder: Path, name: str) -> None:
 def test_a_damaged_file_is_named(damaged: Path, name: str, damage: str) -> None:
     path = damaged / name
     path.write_bytes(DAMAGES[damage](path.read_bytes()))
-    refused(damaged, name)
+    assert_refused(damaged, name)
 
 
 def test_a_config_cut_off_at_the_end_of_a_table_is_named(damaged: Path) -> None:
     path = damaged / "config.toml"
     whole = path.read_text()
     path.write_text(whole[: whole.rindex("\n[") + 1])
-    # It is a valid config still.
+    # The truncated text is still a valid config.
     loads(path.read_text())
-    refused(damaged, path.name)
+    assert_refused(damaged, path.name)
 
 
 @pytest.mark.parametrize("name", ["config.toml", *PARQUET])
-def test_a_file_that_is_not_there_is_named(damaged: Path, name: str) -> None:
+def test_a_missing_file_is_named(damaged: Path, name: str) -> None:
     (damaged / name).unlink()
-    refused(damaged, Path(name).name)
+    assert_refused(damaged, Path(name).name)
 
 
-def test_a_part_is_missing_where_its_number_is(damaged: Path) -> None:
+def test_a_missing_part_is_reported_by_its_number(damaged: Path) -> None:
     part = damaged / PARQUET[1]
     part.rename(part.with_name("0002.parquet"))
-    refused(damaged, "0001.parquet is missing")
+    assert_refused(damaged, "0001.parquet is missing")
 
 
 def messages(recording: Recording) -> dict[str, list[bytes]]:
@@ -132,7 +134,7 @@ def test_a_long_run_has_many_parts_which_are_one_table(
     folder.mkdir()
     for name in ("config.toml", "cycles.parquet"):
         shutil.copy(damaged / name, folder / name)
-    # What a killed recorder has left is replaced.
+    # Files of a killed recorder are replaced.
     for _ in range(2):
         signals = signal_tables(folder / "signals", recording.layout)
         for box in recording.layout.timed:
@@ -152,13 +154,15 @@ def test_a_long_run_has_many_parts_which_are_one_table(
 @pytest.mark.parametrize(
     "text", [bytes(range(256)), b'{"kind": 3}\n', b"[]\n", b'{"kind": "outcome", "outcome": 1}\n']
 )
-def test_events_of_something_else_are_named_with_their_line(damaged: Path, text: bytes) -> None:
+def test_lines_that_are_no_events_are_reported_with_their_number(
+    damaged: Path, text: bytes
+) -> None:
     (damaged / "events.jsonl").write_bytes(text)
     with pytest.raises(Failure, match=r"events\.jsonl: (line 1: not an event|not text: byte 128)"):
         write_report(damaged)
 
 
-def test_an_event_that_became_known_late_is_in_its_place(damaged: Path) -> None:
+def test_an_event_that_was_reported_late_is_sorted_by_tick(damaged: Path) -> None:
     path = damaged / "events.jsonl"
     *lines, outcome = path.read_text().splitlines(keepends=True)
     late = read_line(lines[-1]) | {"tick": 7, "code": "late"}
@@ -170,7 +174,7 @@ def test_an_event_that_became_known_late_is_in_its_place(damaged: Path) -> None:
     assert events[-1] == read_line(outcome)
 
 
-def test_a_last_line_that_is_cut_is_left_out_and_said(
+def test_an_incomplete_last_line_is_left_out_with_a_note(
     damaged: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = damaged / "events.jsonl"

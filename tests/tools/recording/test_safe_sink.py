@@ -1,4 +1,4 @@
-"""A sink that fails, or takes long to open: the recorder goes on, and the user gets one message."""
+"""A sink that fails or opens slowly: the recorder continues, and the user gets one message."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ class Failing:
         """Take anything."""
 
     def advance(self, tick: int, lost: Mapping[str, int]) -> None:
-        """Fail once there was one block."""
+        """Fail once a block was written."""
         self.blocks += 1
         if self.blocks > 1:
             raise RuntimeError("the disk\nis full")
 
     def close(self, tick: int, lost: Mapping[str, int]) -> None:
-        """Never come here."""
+        """Never called."""
         raise AssertionError("a sink that failed is not asked again")
 
 
@@ -57,7 +57,7 @@ def test_a_sink_that_fails_is_reported_once_and_not_called_again() -> None:
 
 
 class Taking:
-    """A sink that takes everything, and keeps the calls."""
+    """A sink that takes everything and records the calls."""
 
     def __init__(self) -> None:
         self.calls: list[object] = []
@@ -76,7 +76,7 @@ class Taking:
 
 
 class Opening:
-    """Opens a sink when it may."""
+    """Opens a sink once the test permits it."""
 
     def __init__(self) -> None:
         self.may, self.sink = threading.Event(), Taking()
@@ -104,7 +104,7 @@ def test_rows_wait_for_a_sink_that_takes_long_to_open() -> None:
     [
         ("HURRIED_S", 0.05, True),
         ("OPENED_S", 0.05, False),
-        # One whose opening uses no processor time is not waited for.
+        # The recorder does not wait if opening uses no processor time.
         pytest.param("LOOK_S", 0.02, False, marks=pytest.mark.slow),
     ],
 )

@@ -1,5 +1,4 @@
-"""Signals by name: fields of messages, single numbers of them, names in place of numbers; and
-conditions on them."""
+"""Signals and conditions in the form in which users write them."""
 
 from __future__ import annotations
 
@@ -16,7 +15,7 @@ from rack.tools.recording.signal import Signal, Trigger
 
 
 class Gait(IntEnum):
-    """What the walker does."""
+    """States of the walker."""
 
     STANDS = 0
     WALKS = 1
@@ -92,14 +91,14 @@ UNKNOWN = {
     "xyz": "no such signal; mailboxes: walker.status",
     "walker.status.speed]": "no such signal; nearest: walker.status.speed",
     "walker.status.legs.angle[2]": (
-        "no such index; permitted: walker.status.legs.angle[0 to 1][0 to 1]"
+        "no such index; valid: walker.status.legs.angle[0 to 1][0 to 1]"
     ),
-    "walker.status.speed[0]": "no such index; permitted: walker.status.speed",
+    "walker.status.speed[0]": "no such index; valid: walker.status.speed",
 }
 
 
 @pytest.mark.parametrize(("name", "why"), UNKNOWN.items())
-def test_a_name_that_is_not_known_is_one_line(name: str, why: str) -> None:
+def test_an_unknown_name_is_reported_in_one_line(name: str, why: str) -> None:
     with pytest.raises(Failure) as failure:
         Signal.of(name, [BOX])
     assert str(failure.value).startswith(f"{name}: {why}")
@@ -124,19 +123,19 @@ def test_a_condition_compares_a_number(messages: np.ndarray, text: str, holds: l
 
 UNFIT = {
     "walker.status.speed": (
-        '"{}": not a condition; permitted: as in "servo.status.position[2] > 1.2"'
+        '"{}" is not a condition; write one like "servo.status.position[2] > 1.2"'
     ),
     "walker.status.legs.angle[0] > 1": (
-        "walker.status.legs.angle[0]: numbers of shape [2]; a condition needs a single number"
+        "walker.status.legs.angle[0] is numbers of shape [2]; a condition needs a single number"
     ),
-    "walker.status.name == 1": "walker.status.name: text; a condition needs a single number",
+    "walker.status.name == 1": "walker.status.name is text; a condition needs a single number",
     "walker.status.speed > x": '"{}": x is not a number',
     "walker.status.gait == runs": '"{}": runs is not a number or one of stands, walks',
 }
 
 
 @pytest.mark.parametrize(("text", "why"), UNFIT.items())
-def test_a_condition_that_is_none_is_one_line(text: str, why: str) -> None:
+def test_an_invalid_condition_is_reported_in_one_line(text: str, why: str) -> None:
     with pytest.raises(Failure) as failure:
         Trigger.of(text, [BOX])
     assert (str(failure.value), failure.value.status) == (why.format(text), 2)

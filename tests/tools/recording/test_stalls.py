@@ -1,5 +1,4 @@
-"""What took the cycles of a run: steal, a core that was away without it, a quota. None of it enters
-a budget."""
+"""Causes of lost cycles: steal, absences without steal, and quotas. None enters a budget."""
 
 from __future__ import annotations
 
@@ -35,7 +34,7 @@ SETTLED = 40
 FIRST = obtained_core(0)
 """The clock's core."""
 OTHER = FIRST + 1
-"""The core of the lower level and its planner, whatever this machine has."""
+"""The core of the lower level and of its planner, whatever cores this machine has."""
 
 
 @pytest.fixture
@@ -45,22 +44,21 @@ def config(small: Path) -> RackConfig:
 
 
 def skipping(count: int) -> int:
-    """Return the flags of a cycle before which so many releases were skipped."""
+    """Return the flags of a cycle before which `count` releases were skipped."""
     return count << SKIPPED_SHIFT | int(Flag.SKIPPED)
 
 
 def resumed_at(end_ms: float, skips: int = 2) -> Cycle:
-    """Return the first cycle after a stall that ended then, and cost so many releases."""
+    """Return the first cycle after a stall that ended at `end_ms` and cost `skips` releases."""
     return Cycle(int(end_ms // TICK_MS), PLAIN, late=end_ms % TICK_MS, flags=skipping(skips))
 
 
-def plain(first: int, last: int) -> list[Cycle]:
+def plain_cycles(first: int, last: int) -> list[Cycle]:
     return [Cycle(tick, PLAIN) for tick in range(first, last)]
 
 
 def late_clock(tick: int, since: int, late_ms: float) -> dict[str, Any]:
-    """Return the event of the clock's board that was due at tick `since`, and woke that much
-    later."""
+    """Return the event of a clock board that was due at tick `since` and woke `late_ms` later."""
     about = {"kind": "miss", "board": "clock", "code": "clock_late", "text": "", "time_ns": 0}
     return about | {"tick": tick, "since": since, "value": late_ms * MS}
 
@@ -82,152 +80,164 @@ def run(
     return recorded(folder, config, traces, [*events, outcome])
 
 
-def found_in(recording: Recording) -> Stalls:
+def find_stalls(recording: Recording) -> Stalls:
     return stalls_of(recording)[0]
 
 
-def test_skipped_cycles_are_lost_while_the_hypervisor_had_the_core(
+def test_skipped_cycles_are_attributed_to_steal_of_their_core(
     config: RackConfig, tmp_path: Path
 ) -> None:
     skipped = Cycle(20, PLAIN, flags=skipping(5))
     recording = run(
         tmp_path / "run",
         config,
-        {"lower": [*plain(8, 15), skipped, Cycle(30, PLAIN, flags=skipping(2))]},
+        {"lower": [*plain_cycles(8, 15), skipped, Cycle(30, PLAIN, flags=skipping(2))]},
     )
-    # Releases 15 to 19 were skipped; the record after them begins at tick 20.
+    # Releases 15 to 19 were skipped. The next record begins at tick 20.
     for first, last, during in ((14.0, 14.8, 0), (15.2, 16.0, 5), (19.2, 19.8, 5), (20.2, 20.9, 0)):
         span = Stolen(int(first * TICK_MS * MS), int(last * TICK_MS * MS), OTHER, 10)
         recording.cores = CoreRecord(100 * MS, (span,))
-        found = found_in(recording)
+        found = find_stalls(recording)
         assert (found.lost, found.during_steal) == (7, during)
     recording.cores = CoreRecord(100 * MS, (Stolen(0, 50 * MS, OTHER, 10),))
-    line = (
-        f"took core {OTHER} for 10.00 % of the run (steal); 5 of 7 lost cycles were due meanwhile"
-    )
+    line = f"took core {OTHER} for 10.00 % of the run (steal); 5 of 7 lost cycles were due at these"
     assert line in markdown(report_of(recording))
 
 
-def test_stalls_that_end_at_one_phase_of_100_ms_are_named(
+def test_stalls_that_end_at_the_same_phase_suggest_a_quota(
     config: RackConfig, tmp_path: Path
 ) -> None:
     jitter = np.random.default_rng(3).uniform(0, 1.5, 11)
     ends = [*(100.0 * k + 31.2 + jitter[k] for k in range(11)), 1260.0, 1388.0]
     recording = run(tmp_path / "run", config, {"lower": [resumed_at(end) for end in ends]})
-    assert found_in(recording).quota == Quota(together=11, stalls=13, levels=[])
+    assert find_stalls(recording).quota == Quota(together=11, stalls=13, levels=[])
     report = report_of(recording)
     assert report["stalls"]["quota"] == {"together": 11, "stalls": 13, "levels": []}
-    assert "- 11 of 13 stalls end at one phase of 100 ms: a quota of the host\n" in markdown(report)
+    line = (
+        "- 11 of 13 stalls end at the same phase of a 100 ms period, which suggests a quota of the"
+        " host\n"
+    )
+    assert line in markdown(report)
 
 
-def test_losses_of_several_tasks_and_cycles_by_one_stall_count_once(
-    config: RackConfig, tmp_path: Path
-) -> None:
+def test_overlapping_losses_count_as_one_stall(config: RackConfig, tmp_path: Path) -> None:
     ends = [100.0 * k + 31.2 for k in range(1, 7)]
     upper = [Cycle(int((end - 15) // TICK_MS), PLAIN, late=15.4, flags=MISSED) for end in ends]
-    # The stall begins within a cycle, which is late; those after it are skipped.
+    # The stall begins within a cycle, which is late. The next cycles are skipped.
     struck = [Cycle(int(end // TICK_MS) - 3, (0.0, 0.1, 7.2, 0.1), flags=MISSED) for end in ends]
     both = [cycle for pair in zip(struck, map(resumed_at, ends), strict=True) for cycle in pair]
-    found = found_in(run(tmp_path / "run", config, {"upper": upper, "lower": both}))
+    found = find_stalls(run(tmp_path / "run", config, {"upper": upper, "lower": both}))
     assert found.lost == 6 * 4
     assert found.quota == Quota(together=6, stalls=6, levels=[])
 
 
-def test_a_level_whose_cycle_agrees_with_the_stalls_is_named_too(
+def test_a_level_with_the_period_of_the_stalls_is_a_possible_cause(
     small: Path, tmp_path: Path
 ) -> None:
     config = load(small, ["clock.mode=realtime", "board.upper.rate_hz=5"])
     beyond = [resumed_at(200.0 * k + 31.2) for k in range(6)]
     recording = run(tmp_path / "run", config, {"lower": beyond})
-    assert found_in(recording).quota == Quota(together=6, stalls=6, levels=["upper"])
-    line = "- 6 of 6 stalls end at one phase of 100 ms: the cycle of upper or a quota of the host\n"
+    assert find_stalls(recording).quota == Quota(together=6, stalls=6, levels=["upper"])
+    line = (
+        "- 6 of 6 stalls end at the same phase of a 100 ms period, which suggests the cycle of"
+        " upper or a quota of the host\n"
+    )
     assert line in markdown(report_of(recording))
-    # At another release of the quota, as many ends lie at two phases of that level.
+    # With another phase of the quota, the ends lie at two phases of the level.
     either = [resumed_at(100.0 * k + 31.2) for k in range(6)]
-    assert found_in(run(tmp_path / "run", config, {"lower": either})).quota == Quota(6, 6, [])
+    assert find_stalls(run(tmp_path / "run", config, {"lower": either})).quota == Quota(6, 6, [])
 
 
-def away() -> dict[str, list[Cycle]]:
-    """Return traces in which the other core was away from tick 50, its release, until 1 ms after
-    tick 52."""
+def absence_trace() -> dict[str, list[Cycle]]:
+    """Return traces in which the other core was away from tick 50 until 1 ms after tick 52."""
     return {
         "lower": [
-            *plain(SETTLED, 50),
+            *plain_cycles(SETTLED, 50),
             Cycle(52, PLAIN, late=1.0, flags=skipping(2)),
-            *plain(53, 60),
+            *plain_cycles(53, 60),
         ]
     }
 
 
-def test_a_core_that_vanished_without_steal_is_named(config: RackConfig, tmp_path: Path) -> None:
-    recording = run(tmp_path / "run", config, away())
-    assert found_in(recording).absences == [Absence(OTHER, times=1, longest_ms=6.0, lost=2)]
+def test_an_absence_of_a_core_without_steal_is_reported(config: RackConfig, tmp_path: Path) -> None:
+    recording = run(tmp_path / "run", config, absence_trace())
+    assert find_stalls(recording).absences == [Absence(OTHER, times=1, longest_ms=6.0, lost=2)]
     report = report_of(recording)
     assert report["stalls"]["absences"] == [
         {"core": OTHER, "times": 1, "longest_ms": 6.0, "lost": 2}
     ]
     line = (
-        f"- core {OTHER} ran nothing of the rack though it was due, without steal (stalls: 1,"
-        " longest 6 ms); 2 of 2 "
+        f"- core {OTHER} was away although no steal was counted (stalls: 1, longest 6 ms); 2 of 2 "
     )
     assert line in markdown(report)
 
 
-def test_a_core_that_ran_another_task_was_there(config: RackConfig, tmp_path: Path) -> None:
+def test_a_core_that_ran_another_task_was_not_absent(config: RackConfig, tmp_path: Path) -> None:
     # The planner ends its plan, at a higher priority, 0.2 ms before the executor gets the core.
     plan = Cycle(48, (0.0, 0.1, 10.6, 0.1), flags=PLANNED)
-    assert not found_in(run(tmp_path / "run", config, away() | {"lower.planner": [plan]})).absences
+    assert not find_stalls(
+        run(tmp_path / "run", config, absence_trace() | {"lower.planner": [plan]})
+    ).absences
 
 
 def test_a_task_without_real_time_priority_shows_no_absence(
     config: RackConfig, tmp_path: Path
 ) -> None:
-    # The launch was refused all of them.
+    # The launch obtained no real-time priority.
     long = {"upper": [Cycle(48, (0.0, 0.1, 15.0, 0.1)), Cycle(88, PLAIN)]}
     late = late_clock(52, since=50, late_ms=5.9)
-    refused = run(tmp_path / "refused", config, away() | long, late, priority=0)
-    assert not found_in(refused).absences
+    refused = run(tmp_path / "refused", config, absence_trace() | long, late, priority=0)
+    assert not find_stalls(refused).absences
     assert [cycles.stalled for cycles in cycles_of(refused).values()] == [0, 0]
 
 
-def test_what_was_counted_as_steal_is_not_counted_again(config: RackConfig, tmp_path: Path) -> None:
-    recording = run(tmp_path / "run", config, away())
-    recording.cores = CoreRecord(200 * MS, (Stolen(120 * MS, 130 * MS, OTHER, 10),))
-    assert (found_in(recording).during_steal, found_in(recording).absences) == (2, [])
-
-
-def test_cycles_that_no_clock_released_are_lost_to_the_clocks_core(
+def test_counted_steal_is_not_reported_as_an_absence_again(
     config: RackConfig, tmp_path: Path
 ) -> None:
-    recording = run(tmp_path / "run", config, away(), late_clock(52, since=50, late_ms=5.9))
-    assert found_in(recording).absences == [Absence(FIRST, times=1, longest_ms=5.9, lost=2)]
+    recording = run(tmp_path / "run", config, absence_trace())
+    recording.cores = CoreRecord(200 * MS, (Stolen(120 * MS, 130 * MS, OTHER, 10),))
+    assert (find_stalls(recording).during_steal, find_stalls(recording).absences) == (2, [])
+
+
+def test_cycles_lost_to_a_late_clock_are_attributed_to_the_clocks_core(
+    config: RackConfig, tmp_path: Path
+) -> None:
+    recording = run(
+        tmp_path / "run", config, absence_trace(), late_clock(52, since=50, late_ms=5.9)
+    )
+    assert find_stalls(recording).absences == [Absence(FIRST, times=1, longest_ms=5.9, lost=2)]
 
 
 def test_lockstep_has_no_stalls(small: Path, tmp_path: Path) -> None:
     long = {"lower.planner": [Cycle(SETTLED, (0.0, 0.1, 60.0, 0.1), flags=PLANNED)]}
-    recording = run(tmp_path / "run", load(small), away() | long)
-    assert found_in(recording) == Stalls(2, 0, [], None)
+    recording = run(tmp_path / "run", load(small), absence_trace() | long)
+    assert find_stalls(recording) == Stalls(2, 0, [], None)
     assert [cycles.stalled for cycles in cycles_of(recording).values()] == [0, 0]
 
 
-def test_a_cycle_with_a_stall_in_it_enters_no_budget(config: RackConfig, tmp_path: Path) -> None:
+def test_stalled_cycles_do_not_count_towards_a_budget(config: RackConfig, tmp_path: Path) -> None:
     long = Cycle(50, (0.0, 0.1, 6.3, 0.1))
     trace = {
-        "lower": [*plain(SETTLED, 50), long, Cycle(53, PLAIN, flags=skipping(2)), *plain(54, 60)]
+        "lower": [
+            *plain_cycles(SETTLED, 50),
+            long,
+            Cycle(53, PLAIN, flags=skipping(2)),
+            *plain_cycles(54, 60),
+        ]
     }
     computed = run(tmp_path / "computed", config, trace)
     assert measured_budgets(computed)["lower"].process_ns == round(6.3 * MS)
     assert cycles_of(computed)["lower"].stalled == 0
     stolen = run(tmp_path / "stolen", config, trace)
     stolen.cores = CoreRecord(200 * MS, (Stolen(126 * MS, 130 * MS, OTHER, 10),))
-    # The clock's board was away meanwhile, so the whole machine may have been.
+    # The clock board was away at that time, so the whole machine may have been.
     away = run(tmp_path / "away", config, trace, late_clock(52, since=51, late_ms=3.0))
     for recording in (stolen, away):
         assert measured_budgets(recording)["lower"].process_ns == MS
         analysis = Analysis.of(recording)
-        assert "cycles with a stall in them are not judged: lower 1\n" in text(analysis)
+        assert "stalled cycles are not judged: lower 1\n" in text(analysis)
         task = document(analysis)["tasks"]["lower"]
         left = len(trace["lower"]) - 1
         assert (task["cycles"], task["start_up"], task["stalled"]) == (left, 0, 1)
-        # The report's own times are of all cycles.
+        # The report gives the times of all cycles.
         assert report_of(recording)["tasks"]["lower"]["execution_ms"]["max"] == 6.3

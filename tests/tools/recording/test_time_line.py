@@ -1,5 +1,4 @@
-"""Recordings of several racks on one time line: what racks record of each other's clocks leads from
-one to the next."""
+"""Recordings of several racks on one time line, connected by their clock comparisons."""
 
 from __future__ import annotations
 
@@ -16,14 +15,13 @@ from tests.tools.machines import CLOCK_NS, ERROR_NS, MS, TICKS, A, B, C, Machine
 
 
 def check_place(place: RackPlace, own: Machine, line: Machine) -> None:
-    """Check that each tick is on the line where its true time is, within the uncertainty."""
+    """Check that the time of each tick is right within the uncertainty."""
     ticks = np.arange(0, TICKS, 7)
     found = place.times_ns(ticks, 0)
     true = [line.shows(own.true_ns(int(tick))) - line.epoch_ns for tick in ticks]
     apart_ns = np.abs(found - np.array(true) * line.speed)
     assert apart_ns.max() <= place.uncertainty_ns * line.speed + MS // 1000
-    # It says no more than it has to: what one comparison left open, and the drift where there was
-    # none.
+    # The uncertainty covers only the error of a comparison and the drift between comparisons.
     assert place.uncertainty_ns <= (ERROR_NS + 7 * S * DRIFT_PPM // 1_000_000) * len(place.shifts)
 
 
@@ -37,7 +35,7 @@ def test_a_rack_is_on_the_line_of_another_within_the_stated_uncertainty(
     check_place(second, B, A)
     assert (first.times_ns(np.arange(TICKS), 5) == np.arange(TICKS) * CLOCK_NS + 5).all()
     assert first.uncertainty_ns == 0
-    # The other one's wall clock does not count: it may be wrong.
+    # The other rack's wall clock does not count, because it may be wrong.
     stamps = np.array([B.shows(3 * S)])
     assert (
         second.wall_ns(stamps)[0] - first.wall_ns(np.array([A.shows(3 * S)]))[0]
@@ -45,7 +43,7 @@ def test_a_rack_is_on_the_line_of_another_within_the_stated_uncertainty(
     )
 
 
-def test_racks_that_never_met_are_placed_by_one_that_met_both(tmp_path: Path) -> None:
+def test_racks_that_never_met_are_placed_through_a_common_peer(tmp_path: Path) -> None:
     a, b = recorded(A, [], tmp_path / "a"), recorded(B, [A, C], tmp_path / "b")
     c = recorded(C, [], tmp_path / "c")
     places = on_one_time_line([c, a, b])
@@ -60,7 +58,7 @@ def test_another_launch_of_a_rack_is_refused(tmp_path: Path) -> None:
     one = recorded(A, [B], tmp_path / "a")
     later = recorded(replace(B, begins_ns=B.begins_ns + 60 * S), [], tmp_path / "b")
     with pytest.raises(
-        Failure, match=r"not of the same run: .* 'b' that 'a' met began 60\.00\d s earlier"
+        Failure, match=r"not of the same run: 'a' met a launch of 'b' that began 60\.00\d s earlier"
     ) as refused:
         on_one_time_line([one, later])
     assert refused.value.status == 2
@@ -76,11 +74,11 @@ def test_one_rack_twice_and_two_modes_are_refused(tmp_path: Path) -> None:
         on_one_time_line([one, stepped])
 
 
-def test_in_lockstep_what_one_took_must_be_what_the_other_wrote(tmp_path: Path) -> None:
+def test_in_lockstep_imported_messages_must_equal_the_senders_messages(tmp_path: Path) -> None:
     a, b = replace(A, mode="lockstep"), replace(B, mode="lockstep")
     one, other = recorded(a, [b], tmp_path / "a"), recorded(b, [], tmp_path / "b", counts_from=1)
     with pytest.raises(
         Failure,
-        match=r"not of the same run: what 'a' took from 'b' at 0\.0000 s, in lan\.other, is",
+        match=r"message that 'a' imported into lan\.other at 0\.0000 s is not one that 'b' wrote",
     ):
         on_one_time_line([one, other])

@@ -1,4 +1,4 @@
-"""Two runs compared: the message that differs, whether its inputs did, and the cause."""
+"""Comparison of two runs: the message that differs, its inputs, and the cause."""
 
 from __future__ import annotations
 
@@ -99,13 +99,15 @@ def ran(rack_name: str, tmp_path: Path) -> Run:
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Run, Recording, Recording]:
-    """What runs the same rack again, a run, and one with another parameter of its level."""
+    """A function that runs the same rack again, a run, and a run with another parameter."""
     run = run_in(tmp_path_factory.mktemp("against"), f"test-against-{os.getpid()}")
     return run, run("one", REMEMBERING), run("two", REMEMBERING, "board.wave.params.factor=2")
 
 
-def why(one: Recording, other: Recording, *, of: str = "", repeats: bool = True) -> dict[str, Any]:
-    """Return what the report says of two runs."""
+def explain_difference(
+    one: Recording, other: Recording, *, of: str = "", repeats: bool = True
+) -> dict[str, Any]:
+    """Return the explanation in the report of two runs."""
     return compared(one, OtherRun(other.folder, of, repeats))
 
 
@@ -124,7 +126,7 @@ def _losing(run: Recording) -> Path:
 def test_equal_runs_have_no_chain(runs: tuple[Run, Recording, Recording], tmp_path: Path) -> None:
     _, one, _ = runs
     again = Recording(Path(shutil.copytree(one.folder, tmp_path / "again")))
-    found = why(one, again)
+    found = explain_difference(one, again)
     assert (found["first_difference"], found["chain"], found["repetition"]) == (None, [], None)
     assert found["explained"]
 
@@ -133,7 +135,7 @@ def test_a_parameter_is_named_with_the_attributes_that_it_changed(
     runs: tuple[Run, Recording, Recording],
 ) -> None:
     _, one, two = runs
-    found = why(two, one)
+    found = explain_difference(two, one)
     (cycle,) = found["chain"]
     assert (cycle["tick"], cycle["mailbox"], cycle["writer"]) == (0, "wave.status", "wave")
     assert (cycle["read"], cycle["unequal"]) == ((), "")
@@ -145,20 +147,20 @@ def test_a_parameter_is_named_with_the_attributes_that_it_changed(
     assert {"name": "_factor", "here": 2.0, "there": 1.0} in repetition["attributes"]
 
 
-def test_of_a_branch_the_level_is_shown_at_the_tick_where_it_branches_off(
+def test_a_branch_shows_the_state_of_the_level_at_its_first_tick(
     runs: tuple[Run, Recording, Recording], tmp_path: Path
 ) -> None:
     _, one, _ = runs
     config = branched(one, ["board.wave.params.factor=2"], None)
     with RunAgain(one) as again:
         run_rack(config, SECONDS, tmp_path / "two", Display(), begins=again.beginning(150))
-    found = why(Recording(tmp_path / "two"), one)
+    found = explain_difference(Recording(tmp_path / "two"), one)
     (cycle,) = found["chain"]
     assert (cycle["tick"], cycle["mailbox"]) == (150, "wave.status")
     repetition = found["repetition"]
     assert {"name": "_factor", "here": 2.0, "there": 1.0} in repetition["attributes"]
     assert (repetition["because"], repetition["strays"]) == ("state", {})
-    # What it remembers is the first run's: only the parameter has changed it.
+    # The branch has the memory of the first run, changed by the parameter alone.
     assert {one["name"] for one in repetition["attributes"]} == {"_factor", "_half"}
 
 
@@ -176,16 +178,16 @@ def test_a_fault_is_the_cause_and_nothing_is_repeated(
     again, one, _ = runs
     fault = f"[[fault]]\nkind = '{kind}'\nboard = 'wave'\ntick = 130\n{more}\n"
     two = again(kind, REMEMBERING, faults=fault)
-    found = why(one, two)
+    found = explain_difference(one, two)
     (cycle,) = found["chain"]
     assert (cycle["tick"], cycle["mailbox"]) == (130, "wave.status")
     assert cycle["fields"][0]["name"] == field
     assert {clue["kind"] for clue in cycle["clues"]} == kinds
     assert {clue["run"] for clue in cycle["clues"]} == {str(two.folder)}
     assert (found["repetition"], found["not_repeated"]) == (None, "")
-    # From the watching level, which takes note of a loss, back to the board that was killed.
+    # The chain leads from the watching level, which noticed a loss, to the killed board.
     if "died" in kinds:
-        away = why(one, two, of="watch.status")["chain"]
+        away = explain_difference(one, two, of="watch.status")["chain"]
         assert [cycle["mailbox"] for cycle in away] == ["watch.status", "wave.status"]
         assert away[0]["unequal"] == "wave.status"
 
@@ -197,7 +199,7 @@ def test_a_level_whose_code_has_changed_is_named(ran: Run, tmp_path: Path) -> No
     one = ran("one", text)
     level.write_text(OWN_LEVEL.replace("AFTER", "self._sum + 1.0"))
     two = ran("two", text)
-    found = why(one, two)
+    found = explain_difference(one, two)
     (cycle,) = found["chain"]
     assert (cycle["tick"], cycle["writer"]) == (250, "adding")
     assert cycle["fields"] == ({"name": "adding.sum.value[1]", "here": 251.0, "there": 252.0},)
@@ -205,8 +207,8 @@ def test_a_level_whose_code_has_changed_is_named(ran: Run, tmp_path: Path) -> No
     repetition = found["repetition"]
     assert (repetition["because"], repetition["runs"]) == ("code", (str(one.folder),))
     assert repetition["attributes"] == ()
-    # The other level only passes on what it has read.
-    chain = why(one, two, of="passing.sum", repeats=False)["chain"]
+    # The other level only forwards its input.
+    chain = explain_difference(one, two, of="passing.sum", repeats=False)["chain"]
     assert [(one["mailbox"], one["unequal"]) for one in chain] == [
         ("passing.sum", "adding.sum"),
         ("adding.sum", ""),
@@ -216,11 +218,11 @@ def test_a_level_whose_code_has_changed_is_named(ran: Run, tmp_path: Path) -> No
 def test_an_operators_command_is_the_cause(ran: Run) -> None:
     one = ran("one", COMMANDED)
     two = ran("two", COMMANDED, commands("level = 'upper', what = 'hold', tick = 80"))
-    (cycle,) = why(one, two)["chain"]
+    (cycle,) = explain_difference(one, two)["chain"]
     assert (cycle["tick"], cycle["mailbox"], cycle["writer"]) == (80, "upper.operator", "clock")
     (clue,) = cycle["clues"]
     assert (clue["kind"], clue["run"]) == ("command", str(two.folder))
-    chain = why(one, two, of="lower.status", repeats=False)["chain"]
+    chain = explain_difference(one, two, of="lower.status", repeats=False)["chain"]
     boxes = ["lower.status", "upper.command", "upper.operator"]
     assert [cycle["mailbox"] for cycle in chain] == boxes
 
@@ -231,7 +233,7 @@ def test_the_command_prints_the_chain_and_refuses_what_cannot_be_compared(
     _, one, two = runs
     done = rack("report", two.folder, "--against", one.folder)
     assert done.returncode == 1
-    assert "  - not repeated: --repeat runs both racks again, to that cycle" in done.stdout
+    assert "  - not repeated: --repeat runs both racks again, up to that cycle" in done.stdout
     assert f"  - board.wave.params.factor is 2, in {one.folder} not set" in done.stdout.splitlines()
     other = ran("other", COMMANDED)
     against = (one.folder, "--against")

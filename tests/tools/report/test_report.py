@@ -1,4 +1,4 @@
-"""Reports: the numbers of a run, from its recording alone."""
+"""Reports contain the figures of a run, computed from its recording alone."""
 
 from __future__ import annotations
 
@@ -43,19 +43,19 @@ def test_the_messages_of_other_systems_have_the_names_that_the_report_looks_for(
 
 
 class Watchful(Display):
-    """Looks often: a run in lockstep is soon over."""
+    """Looks often, because a run in lockstep ends soon."""
 
     period_s = 0.02
 
 
 def cycle(tick: int, late: float, read: float, process: float, write: float) -> tuple[int, ...]:
-    """Return a trace record of a cycle of a 10 ms task, of times in ms."""
+    """Return a trace record of a cycle of a 10 ms task, given times in ms."""
     release = tick * 10 * MS
     times = np.cumsum([release, late * MS, 0, read * MS, process * MS, write * MS]).astype(int)
     return (tick, *times.tolist(), 0, 0, round((read + process + write) * MS), 0)
 
 
-def test_times_of_a_task_are_those_of_equation_3_5() -> None:
+def test_times_of_a_task_follow_equation_3_5() -> None:
     cycles = np.array(
         [cycle(0, 1, 0.5, 3, 0.5), cycle(1, 2, 1, 4, 1), cycle(2, 0, 0.5, 2, 0.5)], RECORD
     )
@@ -71,7 +71,7 @@ def test_times_of_a_task_are_those_of_equation_3_5() -> None:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run in lockstep of two levels, of 40 and 5 ticks."""
+    """A lockstep run of two levels with periods of 40 and 5 ticks."""
     return slow_run(tmp_path_factory)
 
 
@@ -91,8 +91,8 @@ def test_measured_response_of_a_run_meets_its_prediction(folder: Path) -> None:
     assert json.loads((folder / "report.json").read_text()) == report
 
 
-class Cut(Recording):
-    """A recording without ten of the commands; `lost` says whether it is known to lack them."""
+class CutRecording(Recording):
+    """A recording without ten of the commands. `lost` says whether their loss is known."""
 
     lost: ClassVar[dict[str, int]] = {"upper.command": 10}
 
@@ -101,22 +101,22 @@ class Cut(Recording):
         return np.delete(values, slice(20, 30), axis=0) if mailbox == "upper.command" else values
 
 
-class Silent(Cut):
-    """A run in which those commands were never written."""
+class SilentRecording(CutRecording):
+    """A recording of a run in which these commands were never written."""
 
     lost: ClassVar[dict[str, int]] = {}
 
 
 @pytest.mark.slow
 def test_a_response_is_not_measured_across_messages_that_the_recording_lacks(folder: Path) -> None:
-    way = report_of(Cut(folder))["system_response"]["command"]
+    way = report_of(CutRecording(folder))["system_response"]["command"]
     assert (way["holds"], way["beyond"], way["unseen"]) == (True, [], 1)
     assert way["measured_ms"]["max"] == way["bound_ms"]
 
 
 @pytest.mark.slow
-def test_a_response_beyond_its_bound_fails_and_says_what_delayed_it(folder: Path) -> None:
-    recording = Silent(folder)
+def test_a_response_beyond_its_bound_fails_with_the_cause_of_the_delay(folder: Path) -> None:
+    recording = SilentRecording(folder)
     recording.ended["faults"] = [
         {"kind": "mute", "board": "upper", "began": 19 * 40, "ends": 30 * 40}
     ]
@@ -137,7 +137,7 @@ def test_a_response_beyond_its_bound_fails_the_run_unless_something_explains_it(
 ) -> None:
     sound = report_of(Recording(folder))
     assert (sound["worked"], sound["failures"], sound["unjudged"]) == (True, [], [])
-    report = report_of(Silent(folder))
+    report = report_of(SilentRecording(folder))
     (failure,) = report["failures"]
     assert report["worked"] is False
     assert failure == (
@@ -145,7 +145,7 @@ def test_a_response_beyond_its_bound_fails_the_run_unless_something_explains_it(
         " times exceeded without a lost cycle"
     )
     assert markdown(report).splitlines()[0] == f"# {report['rack']} failed: {failure}"
-    explained = Silent(folder)
+    explained = SilentRecording(folder)
     mute = {"kind": "mute", "board": "upper", "began": 760, "ends": 1200, "tick": 760}
     explained.ended["faults"] = [mute | {"fault": 0}]
     assert report_of(explained)["worked"]
@@ -153,7 +153,7 @@ def test_a_response_beyond_its_bound_fails_the_run_unless_something_explains_it(
 
 @pytest.mark.slow
 def test_the_response_of_a_rack_that_imports_messages_is_not_judged(folder: Path) -> None:
-    response = system_response(Silent(folder))
+    response = system_response(SilentRecording(folder))
     assert response is not None
     assert response["crosses_racks"] is False
     ended = Recording(folder).ended
@@ -162,7 +162,7 @@ def test_the_response_of_a_rack_that_imports_messages_is_not_judged(folder: Path
 
 
 @pytest.mark.slow
-def test_lockstep_reports_no_time_that_is_held_against_the_clock(folder: Path) -> None:
+def test_lockstep_reports_no_time_relative_to_the_clock(folder: Path) -> None:
     report, text = write_report(folder)
     for task in report["tasks"].values():
         times = ("lateness_ms", "residual_ms", "alpha_ms", "deviation_ms", "largest_gap_ms")
@@ -175,7 +175,7 @@ def test_lockstep_reports_no_time_that_is_held_against_the_clock(folder: Path) -
 
 
 @pytest.mark.slow
-def test_the_section_of_misses_says_where_it_holds_fewer_than_the_headline(folder: Path) -> None:
+def test_the_section_of_misses_explains_why_it_lists_fewer_than_the_headline(folder: Path) -> None:
     late = {"task": "lower", "tick": 5, "what": "late", "count": 1} | {
         "started_ms": 0.1,
         "took_ms": 3.0,
@@ -186,7 +186,7 @@ def test_the_section_of_misses_says_where_it_holds_fewer_than_the_headline(folde
     assert "## Missed and skipped cycles: 1 and 3" in lines
     assert "The tasks counted" not in markdown(report)
     fewer = markdown({**report, "missed": 2, "skipped": 7})
-    assert "The tasks counted 2 and 7; the recording does not hold all of it." in fewer
+    assert "The tasks counted 2 and 7; the recording does not contain all of them." in fewer
     lossy = markdown({**report, "missed": 2, "skipped": 7, "rows_lost": {"lower": 4}})
     assert "The tasks counted 2 and 7; the recorder lost rows." in lossy
     assert "- the recorder lost rows: lower 4" in lossy.splitlines()
@@ -194,7 +194,7 @@ def test_the_section_of_misses_says_where_it_holds_fewer_than_the_headline(folde
 
 @pytest.mark.slow
 @pytest.mark.parametrize("width", [80, 120])
-def test_what_a_terminal_shows_of_a_report_fits_its_width(folder: Path, width: int) -> None:
+def test_a_report_fits_the_width_of_the_terminal(folder: Path, width: int) -> None:
     report = {**write_report(folder)[0], "mode": "realtime"}
     task = {
         **report["tasks"]["lower"],
@@ -254,7 +254,7 @@ TOUCHED = "level 'servo': unintended contact: 'post' touches 'link4' at 3.125 s"
         ({"cause": "task done", "reason": "all done", "faults": []}, ": task done: all done"),
     ],
 )
-def test_what_ended_a_run_or_is_latched_is_its_headline(
+def test_the_headline_names_the_end_of_the_run_and_latched_faults(
     folder: Path, outcome: dict[str, object], headline: str
 ) -> None:
     recording = Recording(folder)

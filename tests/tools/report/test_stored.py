@@ -1,5 +1,4 @@
-"""The report in a run's folder: shown as it is while it is newer than the recording and the
-program."""
+"""The stored report of a run is shown while it is newer than recording and program."""
 
 from __future__ import annotations
 
@@ -28,7 +27,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def make_newer(path: Path) -> None:
-    """Date a file after everything else."""
+    """Set the modification time of a file after all others."""
     later_ns = time.time_ns() + 10**9
     os.utime(path, ns=(later_ns, later_ns))
 
@@ -58,7 +57,7 @@ CHANGES: dict[str, tuple[Callable[[Path], object], tuple[str, ...]]] = {
         for name in names
     ],
 )
-def test_it_is_shown_until_a_file_has_changed(
+def test_a_stored_report_is_shown_until_a_file_changes(
     folder: Path, change: Callable[[Path], object], name: str
 ) -> None:
     assert stored_report(folder) == write_report(folder)
@@ -66,7 +65,7 @@ def test_it_is_shown_until_a_file_has_changed(
     assert stored_report(folder) is None
 
 
-def test_it_is_made_anew_once_the_program_has_changed(
+def test_a_report_is_rebuilt_when_the_program_changes(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(stored, "PROGRAM", tmp_path)
@@ -79,7 +78,7 @@ def test_it_is_made_anew_once_the_program_has_changed(
     assert stored_report(folder) is None
 
 
-def test_it_is_made_anew_in_another_folder_and_after_a_comparison(folder: Path) -> None:
+def test_a_report_is_rebuilt_in_another_folder_and_after_a_comparison(folder: Path) -> None:
     write_report(folder, OtherRun(folder, "", True))
     assert stored_report(folder) is None
     write_report(folder)
@@ -88,7 +87,7 @@ def test_it_is_made_anew_in_another_folder_and_after_a_comparison(folder: Path) 
     assert stored_report(moved) is None
 
 
-def test_the_command_shows_it_and_writes_it_anew_only_when_it_must(folder: Path) -> None:
+def test_the_command_rebuilds_a_report_only_when_necessary(folder: Path) -> None:
     report = json.loads((folder / "report.json").read_text())
     (folder / "report.json").write_text(json.dumps(report | {"digest": "as stored"}))
     (folder / "report.md").write_text("as stored\n")

@@ -1,4 +1,4 @@
-"""The first view of racks: units in titles, legends beside the curves, what each rack is about."""
+"""The initial view of racks: units in titles, legends beside curves, and suitable content."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Part = rrb.Container | rrb.View
 
 
 def views(part: Part, first: bool = False) -> Iterator[rrb.View]:
-    """Yield all views of a part; `first`: only those that show without a click."""
+    """Yield all views of a part, or with `first` only those that are visible at first."""
     if isinstance(part, rrb.View):
         yield part
         return
@@ -42,7 +42,7 @@ def has_legend(view: rrb.TimeSeriesView) -> bool:
 
 
 def plots(name: str, first: bool) -> list[rrb.TimeSeriesView]:
-    """Return the views of curves of a rack."""
+    """Return the plots of a rack."""
     config = load(name)
     robot = config.robot
     cell = None if robot is None else build_cell(robot, config.scene, config.clock_ns)

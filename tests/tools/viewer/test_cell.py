@@ -1,4 +1,4 @@
-"""Shapes of the view against MuJoCo's own geometry, for every kind of geom."""
+"""Shapes of the view agree with MuJoCo's geometry, for every kind of geom."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def model() -> mujoco.MjModel:
 
 
 def column(model: mujoco.MjModel, geom: str, name: str) -> np.ndarray:
-    """Return one component of a geom's shape, one row an instance."""
+    """Return one component of a geom's shape, one row per instance."""
     shape = shape_of(model, model.geom(geom).id)
     assert shape is not None
     batches = {
@@ -92,7 +92,7 @@ def test_points_of_a_geom_are_placed_as_mujoco_places_them(model: mujoco.MjModel
     assert data.xpos[body] + data.xmat[body].reshape(3, 3) @ in_body == pytest.approx(expected)
 
 
-def test_what_hangs_on_a_joint_moves_and_a_mocap_body_too(model: mujoco.MjModel) -> None:
+def test_bodies_on_joints_and_mocap_bodies_are_moving_bodies(model: mujoco.MjModel) -> None:
     assert [model.body(body).name for body in moving_bodies(model)] == ["arm", "hand", "post"]
 
 

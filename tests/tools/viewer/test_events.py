@@ -1,4 +1,4 @@
-"""The log of the viewer: the events of the run, without those of a slow launch."""
+"""The viewer's log contains the events of the run, but not the waits of its launch."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from rack.tools.viewer.reading import read
 from rack.tools.viewer.stream import Stream, Timelines, new_recording
 
 
-def test_what_a_launch_waits_for_is_not_in_the_log(tmp_path: Path) -> None:
+def test_waits_of_a_launch_are_not_in_the_log(tmp_path: Path) -> None:
     config = load("fig2")
     layout = wire(config)
     times = Timelines(layout.clock_ns, Launch(time.time_ns(), 0))

@@ -1,4 +1,4 @@
-"""Forces in a recording: arrows where they are sensed, and curves of what is wanted and exerted."""
+"""Forces in the view: arrows at sensed places, and curves of wanted and exerted forces."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def cell(tmp_path: Path) -> Cell:
 
 
 class Written:
-    """A recording of one message type, which a part of the view writes."""
+    """A recording of one message type, written by a part of the view."""
 
     def __init__(self, folder: Path) -> None:
         self.file = folder / "run.rrd"
@@ -39,7 +39,7 @@ class Written:
     def write(
         self, kind: type[Message], cell: Cell, parts: Iterable[ViewPart], **fields: np.ndarray
     ) -> None:
-        """Write `ROWS` messages with these fields, one a tick."""
+        """Write `ROWS` messages with these fields, one per tick."""
         dtype = [
             ("tick", "i8"),
             ("stamp_ns", "i8"),
@@ -66,9 +66,7 @@ def test_an_arrow_is_the_force_on_the_tool_in_the_worlds_frame(tmp_path: Path, c
     )
 
 
-def test_curves_show_what_is_wanted_of_the_tool_and_what_it_exerts(
-    tmp_path: Path, cell: Cell
-) -> None:
+def test_curves_show_wanted_and_exerted_forces(tmp_path: Path, cell: Cell) -> None:
     wrench, wanted, selected = np.zeros((3, ROWS, 6))
     wrench[:, 2], wanted[:, 2], selected[:, 2] = 18.0, -20.0, 1
     written = Written(tmp_path)
@@ -78,7 +76,7 @@ def test_curves_show_what_is_wanted_of_the_tool_and_what_it_exerts(
     assert np.isnan(read(written.file, "/forces/task_frame/x").values[-1][0])
 
 
-def test_the_contact_is_shown_against_the_arms_limits(tmp_path: Path, cell: Cell) -> None:
+def test_contact_forces_are_shown_with_the_arms_limits(tmp_path: Path, cell: Cell) -> None:
     assert cell.wrist is not None
     written = Written(tmp_path)
     parts = contact_forces(written.stream, cell.wrist.most)

@@ -1,5 +1,4 @@
-"""Several racks in one recording for the viewer: each below its name, on the time line of the
-first."""
+"""Several racks in one recording for the viewer, on the time line of the first."""
 
 from __future__ import annotations
 
@@ -28,9 +27,8 @@ LIVE = ("/recorder/load",)
 """What only the recorder itself can write."""
 
 
-def contents(file: Path) -> dict[tuple[str, str], Any]:
-    """Return all values of all components in a file, in the order of ticks, by entity and
-    component."""
+def read_contents(file: Path) -> dict[tuple[str, str], Any]:
+    """Return the values of all components in a file by entity and component, sorted by tick."""
     found: dict[tuple[str, str], list[Any]] = {}
     for chunk in RrdReader(str(file)).stream().to_chunks():
         if chunk.entity_path.startswith(("/__", *LIVE)):
@@ -51,13 +49,10 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 
 
 @pytest.mark.slow
-def test_one_rack_from_its_files_is_what_its_recorder_made_of_its_rings(
-    run: Recording, tmp_path: Path
-) -> None:
+def test_a_view_built_from_files_equals_the_recorders_view(run: Recording, tmp_path: Path) -> None:
     write_merged(on_one_time_line([run]), tmp_path / "again.rrd", lambda part: None)
-    again, live = contents(tmp_path / "again.rrd"), contents(run.folder / "run.rrd")
-    # Rows of losses come with each block, and blocks are cut elsewhere; so are the ends of lines of
-    # limits.
+    again, live = read_contents(tmp_path / "again.rrd"), read_contents(run.folder / "run.rrd")
+    # Losses and limits are written once per block, and the blocks differ.
     loose = ("/recorder/rows_lost", "limits")
     assert again.keys() == live.keys()
     for key, rows in live.items():
@@ -66,7 +61,7 @@ def test_one_rack_from_its_files_is_what_its_recorder_made_of_its_rings(
 
 
 @pytest.fixture(scope="module")
-def both(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def merged_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("both")
     places = on_one_time_line([recorded(A, [B], folder / "a"), recorded(B, [A], folder / "b")])
     shown: list[float] = []
@@ -76,15 +71,17 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "both.rrd"
 
 
-def test_each_rack_is_below_its_name_and_what_happened_at_one_time_is_at_one_time(
-    both: Path,
+def test_each_rack_is_below_its_name_and_simultaneous_events_coincide(
+    merged_file: Path,
 ) -> None:
-    entities = {path.split("/")[1] for path in RrdReader(str(both)).store().schema().entity_paths()}
+    entities = {
+        path.split("/")[1] for path in RrdReader(str(merged_file)).store().schema().entity_paths()
+    }
     assert {"a", "b"} <= {entity for entity in entities if not entity.startswith("__")}
     assert {entity for entity in entities if not entity.startswith("__")} <= {"a", "b", "log"}
     for machine in (A, B):
         lane = f"/{machine.rack}/boards/2-pulse/executor"
-        chunks = RrdReader(str(both)).stream().filter(content=lane).to_chunks()
+        chunks = RrdReader(str(merged_file)).stream().filter(content=lane).to_chunks()
         batches = [chunk.to_record_batch() for chunk in chunks if "tick" in chunk.timeline_names]
         times, ticks = (
             np.concatenate([batch.column(name).to_numpy() for batch in batches])[::4].astype(int)
@@ -95,8 +92,8 @@ def test_each_rack_is_below_its_name_and_what_happened_at_one_time_is_at_one_tim
         assert (ticks == times // CLOCK_NS).all()
 
 
-def test_how_uncertain_it_is_stands_in_the_log(both: Path) -> None:
-    (line,) = read(both, "/log/time\\ line", "TextLog:text").values.ravel().tolist()
+def test_the_uncertainty_of_times_is_in_the_log(merged_file: Path) -> None:
+    (line,) = read(merged_file, "/log/time\\ line", "TextLog:text").values.ravel().tolist()
     begin = (A.shows(B.begins_ns) - A.epoch_ns) / S
     assert line.startswith(f"rack 'b' is on the time line of 'a': it begins at +{begin:.3f}")
     assert line.endswith(" ms")
@@ -104,7 +101,7 @@ def test_how_uncertain_it_is_stands_in_the_log(both: Path) -> None:
 
 @pytest.fixture
 def branched_runs(rack_name: str, tmp_path: Path) -> Path:
-    """Runs "whole", and "other", which branches off at tick 150; the folder of both."""
+    """The folder of two runs: "whole", and "other", which branches off at tick 150."""
     file = tmp_path / "remembering.toml"
     file.write_text(REMEMBERING)
     config = load(file, [f"name={rack_name}"])
@@ -123,20 +120,20 @@ def test_a_branch_is_shown_on_the_ticks_of_its_run_with_the_fork_marked(
     names = ("other", "--against", "whole", "--out", "both.rrd")
     done = rack("replay", *names, folder=branched_runs)
     assert done.returncode == 0, done.stderr
-    both = branched_runs / "both.rrd"
-    curves = [read(both, f"/{run}/signals/wave.status/value") for run in ("whole", "other")]
+    merged_file = branched_runs / "both.rrd"
+    curves = [read(merged_file, f"/{run}/signals/wave.status/value") for run in ("whole", "other")]
     for rows, run in zip(curves, ("whole", "other"), strict=True):
         own = Recording(branched_runs / run)
         assert rows.ticks.tolist() == own.signal("wave.status", "tick").tolist()
         assert rows.values.ravel().tolist() == own.signal("wave.status", "value").tolist()
     assert (curves[0].ticks[0], curves[1].ticks[0]) == (0, 150)
-    marks = read(both, "/log/time\\ line", "TextLog:text")
+    marks = read(merged_file, "/log/time\\ line", "TextLog:text")
     assert list(zip(marks.ticks.tolist(), marks.values.ravel().tolist(), strict=True)) == [
         (150, "other branches off"),
         (150, "other differs from whole: wave.status"),
     ]
     try:
-        with opened(both) as screen:
+        with opened(merged_file) as screen:
             look = screen.look(at_s=0.5)
             views = set(screen.views)
     except NoViewerError as error:

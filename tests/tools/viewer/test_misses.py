@@ -1,4 +1,4 @@
-"""Missed cycles in the recording: none where none was, and each one where it was."""
+"""Missed cycles in the recording for the viewer."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ TASK = TaskSpec("servo", "servo", "executor", 2, 0, 0, 1, 1, 4)
 
 
 def recorded(folder: Path, missed: list[list[int]]) -> Path:
-    """Write blocks of 400 cycles with misses at those ticks."""
+    """Write blocks of 400 cycles with misses at these ticks."""
     times = Timelines(TICK_NS, Launch(time.time_ns(), 0))
     stream = Stream(new_recording("misses", "run", folder / "run.rrd", rrb.Blueprint()), times)
     write = missed_cycles(stream, TASK)

@@ -1,5 +1,4 @@
-"""Pictures without a screen: where there is no graphics driver either, and who can reach the viewer
-meanwhile."""
+"""Pictures without a screen: a missing graphics driver, and the viewer's network access."""
 
 from __future__ import annotations
 
@@ -38,7 +37,8 @@ def test_without_a_driver_the_cause_and_what_to_install_are_one_line(
     (line,) = done.stderr.splitlines()
     assert "No graphics adapter was found" in line
     assert re.search(
-        "missing packages: apt-get install|no package for it is missing|what Debian calls", line
+        "missing packages: apt-get install|no package for drawing is missing|these Debian packages",
+        line,
     )
 
 

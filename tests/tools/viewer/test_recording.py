@@ -1,4 +1,4 @@
-"""The recording for the viewer, read back: one short run of the whole rack."""
+"""The recording for the viewer, read back from a short run of the whole rack."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_each_cycle_of_each_task_has_its_spans(run: Recording) -> None:
 
 
 @pytest.mark.slow
-def test_an_age_is_that_of_the_newest_visible_message(run: Recording) -> None:
+def test_an_age_belongs_to_the_newest_visible_message(run: Recording) -> None:
     made, visible = (
         run.signal("elemental_move.status", "tick"),
         run.signal("elemental_move.status", "visible_at"),
@@ -89,13 +89,13 @@ def test_an_age_is_that_of_the_newest_visible_message(run: Recording) -> None:
         (tick - made[visible <= tick].max()) * run.layout.clock_ns * 1e-6 for tick in rows.ticks
     ]
     assert rows.values.ravel() == pytest.approx(expected)
-    # Read at once by a board of its own rate or by a slower one: the age is the sampling delay of
-    # the paper.
+    # The message is read immediately by a board of equal or lower rate, so its age is the sampling
+    # delay of the paper.
     assert rows.values.min() == pytest.approx(250.0)
 
 
 @pytest.mark.slow
-def test_config_and_events_are_in_it(run: Recording) -> None:
+def test_the_recording_contains_config_and_events(run: Recording) -> None:
     file = run.folder / "run.rrd"
     document = (
         RrdReader(str(file)).stream().filter(content="/config").to_chunks()[0].to_record_batch()
@@ -108,7 +108,7 @@ def test_config_and_events_are_in_it(run: Recording) -> None:
 
 
 @pytest.mark.slow
-def test_the_blueprint_shows_what_is_there(run: Recording) -> None:
+def test_the_blueprint_shows_only_existing_entities(run: Recording) -> None:
     reader = RrdReader(str(run.folder / "run.rrd"))
     recorded = {path.replace("\\", "") for path in reader.store().schema().entity_paths()}
     chunks = reader.stream(store=reader.blueprints()[0]).to_chunks()
@@ -131,7 +131,7 @@ def test_the_blueprint_shows_what_is_there(run: Recording) -> None:
 
 
 @pytest.mark.slow
-def test_no_view_of_it_fails_in_the_viewer(run: Recording) -> None:
+def test_no_view_fails_in_the_viewer(run: Recording) -> None:
     try:
         with opened(run.folder / "run.rrd") as screen:
             look = screen.look(at_s=NASREM_S - 0.5)

@@ -1,5 +1,4 @@
-"""The viewer's file of a long run: in parts, so that what the library keeps of one is given
-back."""
+"""The viewer's file of a long run is written in parts, so that the library frees memory."""
 
 from __future__ import annotations
 
@@ -38,7 +37,7 @@ def test_a_long_run_is_in_parts_that_are_finished_one_by_one(
             view.advance(end, {})
             parts = [tmp_path / name for name in ("run.rrd", "run-2.rrd", "run-3.rrd", "run-4.rrd")]
             assert [part.exists() for part in parts] == [end >= place * PART for place in range(4)]
-            # All but the newest are complete.
+            # All parts except the newest are complete.
             for part in parts[: end // PART]:
                 subprocess.run(
                     [executable(), "rrd", "verify", part],
@@ -49,5 +48,5 @@ def test_a_long_run_is_in_parts_that_are_finished_one_by_one(
         view.close(TICKS, {})
     whole, *later = [read(part, "/signals/lower.status/count").ticks for part in parts[:3]]
     assert [len(ticks) for ticks in later] == [PART] * 2
-    # The first one's reader goes on in the others.
+    # A reader of the first part continues in the others.
     assert np.array_equal(whole, np.arange(TICKS))

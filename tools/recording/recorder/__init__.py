@@ -1,1 +1,1 @@
-"""The recorder: a separate process that drains a rack's rings into the files of a run."""
+"""The recorder, a separate process that copies a rack's rings into the files of a run."""

@@ -1,8 +1,8 @@
 """The recorder process, `python -m rack.tools.recording.recorder`.
 
 Its argument names the class of the view, "package.module:Class". Its stdin names rack and folder,
-and closes when the run is over. It prints "recording" once it has attached; every other line is a
-message for the user.
+and closes when the run is over. It prints "recording" once it has attached. Every other line that
+it prints is a message for the user.
 """
 
 from __future__ import annotations
@@ -23,17 +23,20 @@ if TYPE_CHECKING:
     from rack.tools.recording.recorder.recorder import Sink
 
 NICENESS = 5
-"""On a shared core, boards go first, even those without real-time priority. No more than
-that: next to three busy programs a core, niceness 10 leaves a thirtieth of it; a recorder needs a
-tenth."""
+"""Niceness of the recorder.
+
+On a shared core boards run first, even those without real-time priority. A higher value would
+starve it: next to three busy programs per core, niceness 10 leaves a thirtieth of the core, but a
+recorder needs a tenth.
+"""
 
 
 def main() -> None:
-    """Attach to the rack that one line of JSON names, and record until stdin closes; another line
-    means: in a hurry.
+    """Attach to the rack named by a line of JSON on stdin, and record until stdin closes.
+
+    A second line asks the recorder to hurry.
     """
-    # Ctrl-C reaches the whole foreground group; but the launcher decides when the recording is
-    # complete.
+    # Ctrl-C reaches the whole foreground group, but the launcher decides when recording ends.
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     os.nice(NICENESS)
@@ -43,7 +46,7 @@ def main() -> None:
     from rack.tools.recording.recorder.process import UNWRITABLE, unwritable
     from rack.tools.recording.recorder.recorder import Recorder, SafeSink
 
-    # It takes half a second. A thread begins with it while the rack is being launched.
+    # The import takes half a second, so a thread does it while the rack is being launched.
     Thread(target=_import_view, daemon=True).start()
     line = sys.stdin.readline()
     if not line:
@@ -56,11 +59,11 @@ def main() -> None:
             _tell("recording")
             recorder.follow(until=sys.stdin.fileno())
             if segment.run_is_over:
-                # No board is left to give way to; but only root may take its niceness back.
+                # No boards are left that need the core. Only root may lower the niceness again.
                 with suppress(PermissionError):
                     os.nice(-NICENESS)
-            # Nobody waits for the viewer's file if the launcher was killed. On a loaded machine its
-            # libraries alone may take a minute; `rack replay` makes it.
+            # If the launcher was killed, nobody waits for the viewer's file, whose libraries alone
+            # may take a minute to load on a busy machine. `rack replay` can make it later.
             is_hurried = sys.stdin.readline() or os.getppid() != launcher
             if is_hurried and view is not None:
                 view.hurry()
@@ -71,25 +74,28 @@ def main() -> None:
 
 
 def _import_view() -> None:
-    # If it is not there, opening the view says so.
+    """Import the module of the view ahead of time."""
+    # If it is missing, opening the view reports that.
     with suppress(LookupError):
         module_and_name(sys.argv[1])
 
 
 def _view(segment: Segment, folder: Path, port: int | None) -> Sink:
+    """Open the view of a run in `folder`, served on a port if one is given."""
     module, name = module_and_name(sys.argv[1])
     sink: Sink = getattr(module, name)(segment, folder, port)
     return sink
 
 
 def _tell(text: str) -> None:
-    # The launcher may be gone; the files are finished all the same.
+    """Print a message for the launcher."""
+    # The launcher may be gone, but the files must still be finished.
     with suppress(OSError):
         print(text, flush=True)
 
 
 if __name__ == "__main__":
     main()
-    # All files are complete. To take the interpreter apart under a thread that still imports could
+    # All files are complete. Shutting down the interpreter while a thread is still importing could
     # crash it.
     os._exit(0)

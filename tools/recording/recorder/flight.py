@@ -1,6 +1,4 @@
-"""The flight recorder: a recorder whose spool is in stretches, and forgets those that are old and
-near no occasion.
-"""
+"""The flight recorder, which deletes old stretches of a recording that are not near an occasion."""
 
 from __future__ import annotations
 
@@ -21,17 +19,22 @@ STRETCH_S = 1.0
 
 
 class Sealed(NamedTuple):
-    """A stretch that is finished, and near no occasion so far: its file, and its last tick."""
+    """A finished stretch that is not near any occasion so far.
+
+    Attributes:
+        path: Its file.
+        last: Its last tick.
+    """
 
     path: Path
     last: int
 
 
 class FlightRecorder:
-    """Divides what a recorder spools into stretches, and removes some of them.
+    """Divides the spool of a recorder into stretches, and deletes stretches that are not needed.
 
-    What a recorder that was killed has left stays: which occasions it saw is not known. A rack
-    restarts its recorder three times at the most.
+    Stretches of a killed recorder are all kept, because the occasions that it had seen are unknown.
+    A rack restarts its recorder at most three times.
     """
 
     def __init__(self, segment: Segment, retention: Retention, spool: Spool, tally: Tally) -> None:
@@ -45,25 +48,33 @@ class FlightRecorder:
         self._kept_until = -1
         self._began = 0
         if tally.number:
-            # The rings hold what another recorder can no longer take.
+            # Rows may have been lost while no recorder was running.
             self._mark(self._words[System.TICK])
         self._path = self._begin(self._began, self._began)
 
     def look(self, ring: str, rows: np.ndarray, lost: int) -> None:
-        """Look for occasions in rows of a ring, before which some were lost: nobody knows what was
-        in those.
+        """Look for occasions in rows of a ring.
+
+        Args:
+            ring: The ring.
+            rows: The rows, shape (rows,).
+            lost: Number of rows lost before them. Lost rows count as an occasion, because their
+                content is unknown.
         """
-        found = [self._words[System.TICK]] if lost else []
-        for tick in (*found, *self._occasions.within(ring, rows)):
+        loss_ticks = [self._words[System.TICK]] if lost else []
+        for tick in (*loss_ticks, *self._occasions.within(ring, rows)):
             self._mark(tick)
 
     def advance(self, tick: int) -> None:
-        """Go on after everything before a tick has been added to the spool."""
-        for at in self._occasions.alarms():
-            self._mark(at)
+        """Continue after everything before `tick` has been added to the spool.
+
+        Begins a new stretch if the current one is long enough, and deletes old ones.
+        """
+        for alarm_tick in self._occasions.alarms():
+            self._mark(alarm_tick)
         if tick - self._began < self._length:
             return
-        # The rows of what has begun meanwhile may be in either of the two.
+        # Rows of cycles that began in the meantime may be in either stretch.
         next_tick = self._words[System.TICK] + 1
         path = self._begin(next_tick, tick)
         if self._began > self._kept_until:
@@ -74,20 +85,20 @@ class FlightRecorder:
             self._sealed.popleft().path.unlink(missing_ok=True)
 
     def close(self) -> None:
-        """Finish the last stretch. An empty one follows, which says what was taken in all."""
+        """Finish the last stretch. An empty one follows, whose head contains the final counts."""
         end = self._words[System.TICK] + 1
         self._begin(end, end)
         self._spool.close(end)
 
     def _begin(self, begin: int, end: int) -> Path:
-        """Begin a stretch, and end the one before it."""
+        """Begin a stretch at tick `begin`, end the previous one at `end`, and return the file."""
         tally = self._tally
         stretch = StretchHead(tally.number + 1, begin, dict(tally.taken), dict(tally.rows))
         tally.begin(stretch)
         return self._spool.divert(stretch, end)
 
     def _mark(self, tick: int) -> None:
-        """Keep the stretches around an occasion for good."""
+        """Keep the stretches around an occasion."""
         window = self._retention.around(tick)
         self._kept_until = max(self._kept_until, window.last)
         while self._sealed and self._sealed[-1].last >= window.first:

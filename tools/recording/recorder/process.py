@@ -1,5 +1,6 @@
-"""The recorder process as its launcher sees it: spawned, never forked, so that no board inherits
-its threads.
+"""The recorder process as its launcher sees it.
+
+It is spawned, never forked, so that no board inherits its threads.
 """
 
 from __future__ import annotations
@@ -18,37 +19,51 @@ from rack.backplane.words import System
 from rack.tools.console.answer import Failure
 
 VIEW = "rack.tools.viewer.sink:ViewSink"
-"""What shows a recording, by name: recording itself needs none of it."""
+"""Class that shows a recording, by name, because recording itself needs none of its libraries."""
 BEGUN = "recording"
-"""Printed by the recorder when it has attached."""
+"""Line that the recorder prints once it has attached."""
 ATTACH_S = 30.0
-"""Longest wait for the recorder to begin."""
+"""Longest time to wait for the recorder to attach."""
 IDLE_LOOKS = 100
 STOPPED_LOOKS = 5
-"""Looks, 0.2 s to 1 s apart, at a recorder that uses no processor time, after which it is killed:
-on a loaded machine it is slow, but never idle. Fewer for one that a signal has stopped. Looks, not
-seconds: Ctrl-Z stops both processes.
+"""Number of idle checks in a row after which a recorder is killed.
+
+A check finds the recorder idle if it has used no processor time since the check before, 0.2 s to 1
+s earlier. On a busy machine a recorder is slow but never idle. The smaller number applies to a
+recorder that a signal has stopped. The limits are checks, not seconds, because Ctrl-Z stops both
+processes.
 """
 LOOK_S = 0.2
-"""Shortest time between two such looks."""
+"""Shortest time between two of these checks."""
 RESTARTS = 3
 UNWRITABLE = os.EX_IOERR
-"""Exit status of a recorder whose files cannot be written, as on a full disk: another one could not
-either."""
+"""Exit status of a recorder whose files cannot be written, for example because the disk is full.
+
+It is not restarted, since another recorder would fail as well.
+"""
 
 ENDS = "the recording ends at tick"
-"""In the line that such a recorder prints; the viewer's library may print more after it."""
+"""Marks the line with the reason among the lines that such a recorder prints.
+
+The viewer's library may print more after it.
+"""
 
 
 def unwritable(folder: Path, error: OSError, tick: int) -> str:
-    """Return why a recording ends before its run."""
-    # The text of pyarrow's own errors is long.
+    """Return a sentence that says why a recording ended before its run.
+
+    Args:
+        folder: Folder of the run.
+        error: The error of writing.
+        tick: Tick up to which the recording is complete.
+    """
+    # Messages of pyarrow are long, so prefer the text of the error number.
     why = os.strerror(error.errno) if error.errno else error
     return f"{folder}: {why}: {ENDS} {tick}"
 
 
 class IdleLooks:
-    """Counts the looks in a row at which a process has used no processor time."""
+    """Counts the checks in a row in which a process has used no processor time."""
 
     def __init__(self, pid: int) -> None:
         self._pid = pid
@@ -56,7 +71,7 @@ class IdleLooks:
         self._count = 0
 
     def look(self) -> int:
-        """Return the number of such looks, this one included; 0 if it has used some."""
+        """Check the process, and return the number of idle checks in a row, including this one."""
         used_ns = processor_ns(self._pid)
         self._count = self._count + 1 if used_ns == self._used_ns else 0
         self._used_ns = used_ns
@@ -64,17 +79,19 @@ class IdleLooks:
 
 
 class RecorderProcess:
-    """A recorder for a rack that is about to run, which records into `folder`; it imports its
-    libraries while the rack is being launched.
+    """Starts and supervises the recorder of a rack that is about to run.
 
-    One that dies is restarted up to RESTARTS times, in the same folder; one that hangs is killed
-    first. Lockstep waits meanwhile. If its files cannot be written, `news` and `finish` raise
-    `Failure`.
+    The recorder imports its libraries while the rack is being launched. If it dies, it is restarted
+    up to `MAX_RESTARTS` times in the same folder; if it hangs, it is killed first. In lockstep the
+    clock waits for it. If its files cannot be written, `read_news` and `finish` raise `Failure`.
+
+    Attributes:
+        folder: Folder of the run.
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        # stderr goes to a file in memory: nobody would empty a pipe.
+        # stderr goes to a file in memory, because nobody would empty a pipe.
         self._complaints = os.memfd_create("recorder")
         self._request = b""
         self._words: memoryview | None = None
@@ -83,6 +100,7 @@ class RecorderProcess:
         self._start()
 
     def _start(self) -> None:
+        """Spawn a recorder process."""
         self._process = subprocess.Popen(
             [sys.executable, "-P", "-m", "rack.tools.recording.recorder", VIEW],
             stdin=subprocess.PIPE,
@@ -103,8 +121,15 @@ class RecorderProcess:
         return self._process.pid
 
     def attach(self, rack: str, port: int | None, words: memoryview | None = None) -> bool:
-        """Record that rack, and serve a viewer on that port; return False if it has not begun in
-        time. With the `words` of a rack in lockstep, that waits for it, in any case.
+        """Let the recorder record a rack.
+
+        Args:
+            rack: Name of the rack.
+            port: Port on which it serves a viewer, or None.
+            words: Words of a rack in lockstep, whose clock then waits for the recorder.
+
+        Returns:
+            False if it has not attached in time.
         """
         self._request = encode_json([rack, str(self.folder), port]).encode() + b"\n"
         self._words = words
@@ -112,7 +137,11 @@ class RecorderProcess:
         return self.await_begun(ATTACH_S)
 
     def await_begun(self, bound_s: float = inf) -> bool:
-        """Wait until it records, dies or hangs, at most `bound_s`; return whether it has begun."""
+        """Wait until the recorder has attached, died or hung, but at most `bound_s`.
+
+        Returns:
+            True if it has attached.
+        """
         deadline = time.monotonic() + bound_s
         while not self._has_begun and time.monotonic() < deadline and self._process.poll() is None:
             self._read(LOOK_S)
@@ -120,15 +149,16 @@ class RecorderProcess:
         return self._has_begun
 
     def _ask(self) -> None:
+        """Send the name of the rack and the folder to the recorder."""
         assert self._process.stdin is not None, "it is a pipe"
-        # The clock waits for it from now on: the rings hold what it needs.
+        # From now on the clock waits for the recorder. Until it reads, the rings hold the rows.
         self._set_follower(self.pid)
         with suppress(BrokenPipeError):
             self._process.stdin.write(self._request)
             self._process.stdin.flush()
 
     def news(self) -> list[str]:
-        """Return messages for the user since the last call, including the recorder's early end."""
+        """Return new messages for the user, and restart the recorder if it has died."""
         had_begun = self._has_begun
         if not self._is_gone:
             self._kill_hung()
@@ -143,19 +173,20 @@ class RecorderProcess:
         return lines
 
     def _kill_hung(self) -> None:
+        """Kill the recorder if it has been idle for too many checks."""
         bound = STOPPED_LOOKS if state_of(self.pid) in STOPPED else IDLE_LOOKS
         if self._idle.look() > bound and not self._is_killed:
             self._is_killed = True
-            self._lines.append("the recorder is not responding: killed")
+            self._lines.append("the recorder did not respond and was killed")
             self._process.kill()
 
     def _end_early(self) -> str:
-        """Restart it, unless it has died too often; return the message for the user."""
+        """Restart a dead recorder unless it has died too often. Returns a message for the user."""
         ended = self._ended()
         if self._restarts == RESTARTS:
             self._is_gone = True
             self._set_follower(0)
-            return f"{ended}; the run continues, unrecorded"
+            return f"{ended}; the run continues without a recording"
         self._restarts += 1
         self._close_pipes()
         self._start()
@@ -163,7 +194,7 @@ class RecorderProcess:
         return f"{ended}; restarted, {self._restarts} of at most {RESTARTS} times"
 
     def _ended(self) -> str:
-        """Return how it ended, with the last line that it printed on stderr."""
+        """Describe how the recorder ended, with the last line that it printed on stderr."""
         size = os.fstat(self._complaints).st_size
         status = self._process.returncode
         text = os.pread(self._complaints, 4096, max(0, size - 4096)).decode(errors="replace")
@@ -173,14 +204,18 @@ class RecorderProcess:
         return ": ".join((f"the recorder ended with status {status}", *lines[-1:]))
 
     def _set_follower(self, pid: int) -> None:
+        """Name the process that the clock in lockstep waits for, or 0 for none."""
         if self._words is not None:
             self._words[System.FOLLOWER_PID] = pid
 
     def finish(self, in_a_hurry: bool = False) -> str:
-        """Let it record what is left and finish its files; return how it ended. It may be called
-        again.
+        """Let the recorder take the remaining rows and finish its files. May be called repeatedly.
 
-        In a hurry it does without the viewer's file if it has not begun that one yet.
+        Args:
+            in_a_hurry: Whether it should skip the viewer's file if that is not open yet.
+
+        Returns:
+            A description of how it ended.
         """
         if self._result is None:
             self._result = ""
@@ -202,18 +237,23 @@ class RecorderProcess:
             finally:
                 os.close(self._complaints)
             if self._process.returncode and not was_reported:
-                # The tables may be complete all the same.
+                # The tables may still be complete.
                 self._lines.append(f"{self._result}; run.rrd may lack its end")
         return self._result
 
     def _close_pipes(self) -> None:
+        """Close the pipes to the recorder."""
         for pipe in (self._process.stdin, self._process.stdout):
             if pipe is not None:
                 with suppress(BrokenPipeError):
                     pipe.close()
 
     def _read(self, timeout_s: float) -> bool:
-        """Read what it printed; return False when nothing came in time, or its output has ended."""
+        """Read the recorder's output.
+
+        Returns:
+            False if nothing came in time, or the output has ended.
+        """
         stdout = self._process.stdout
         if stdout is None or not readable(stdout.fileno(), timeout_s):
             return False

@@ -1,4 +1,4 @@
-"""The recorder: follows a rack by its rings, from the host side, and costs its boards nothing."""
+"""The recorder, which reads the rings of a rack from the host side and never delays its boards."""
 
 from __future__ import annotations
 
@@ -30,41 +30,52 @@ from rack.tools.recording.spool import Spool, rings
 
 REALTIME_S = 0.05
 LOCKSTEP_S = 0.005
-"""How often rings are drained. They hold two seconds; lockstep waits for its recorder and runs
-faster than time."""
+"""Time between two drains of the rings, in real time and in lockstep.
+
+The rings hold two seconds of real time. A rack in lockstep runs faster and waits for its recorder.
+"""
 
 HAND_OVER_S = 0.1
-"""Time of a pass for a sink that is behind: what boards write meanwhile is not in the spool yet."""
+"""Longest time per pass for catching up a late sink.
+
+Rows that boards write in that time are not in the spool yet.
+"""
 OPENED_S = 120.0
-"""Longest time that a recorder at its end waits for a sink that is being opened: on a loaded
-machine the viewer's library alone may take a minute."""
+"""Longest time that a finishing recorder waits for its sink to open.
+
+On a busy machine, loading the viewer's library alone may take a minute.
+"""
 OPENING_LOOKS = 25
-"""Looks, 0.2 s apart, at a process that uses no processor time, after which a sink that is being
-opened counts as hung: the viewer's library waits for ever for a file that cannot be written."""
+"""Number of idle checks in a row, 0.2 s apart, after which opening the sink counts as hung.
+
+The viewer's library waits forever for a file that cannot be written.
+"""
 HURRIED_S = 0.5
-"""Time that a recorder in a hurry waits for a sink that is being opened: an interrupted run ends
-within 2 s."""
+"""Longest time that a hurried recorder waits for its sink to open.
+
+An interrupted run must end within 2 s.
+"""
 
 
 class Sink(Protocol):
-    """Takes what a recorder drains."""
+    """Takes the rows that a recorder drains."""
 
     def add(self, ring: str, rows: np.ndarray) -> None:
-        """Take rows of a ring, shape (rows,): trace records of a task, or messages of a mailbox."""
+        """Take rows of a ring, shape (rows,): trace records of a task or messages of a mailbox."""
 
     def advance(self, tick: int, lost: Mapping[str, int]) -> None:
-        """Note that everything before `tick` has been taken; `lost` counts lost rows by ring."""
+        """Note that everything before `tick` has been added. `lost` counts lost rows by ring."""
 
     def close(self, tick: int, lost: Mapping[str, int]) -> None:
-        """Finish."""
+        """Finish the output at `tick`. `lost` counts lost rows by ring."""
 
 
 class SafeSink:
-    """Wraps a sink that may fail: its first error ends it and is passed to `tell` once; the
-    recorder continues. What it takes is handed over in `advance`, once the spool has it.
+    """Protects the recorder from errors and delays of a sink.
 
-    Opened `in_background`, by a thread, it lets the recorder begin earlier: what it imports may
-    take as long as a launch. The rows of that time wait.
+    The first error ends the sink and is reported once through `tell`, and the recorder continues.
+    Rows are passed on in `advance`, after the spool has them. With `in_background` a thread opens
+    the sink, because its imports may take as long as a launch; rows wait until it is open.
     """
 
     def __init__(
@@ -72,12 +83,12 @@ class SafeSink:
     ) -> None:
         self._tell = tell
         self._sink: Sink | None = None
-        # Kept: the viewer's library waits, maybe for ever, where a stream is dropped whose file
-        # could not be written.
+        # Keep a failed sink alive: dropping a stream whose file could not be written may make the
+        # viewer's library wait forever.
         self._failed: Sink | None = None
         self._waiting: deque[Callable[[Sink], None]] = deque()
         self._late = 0  # calls that were left waiting
-        # A daemon: a process in a hurry does not wait for it.
+        # A daemon thread, so that a hurried process can exit without it.
         self._opening = Thread(
             target=self._guarded,
             args=(lambda: setattr(self, "_sink", opened()),),
@@ -97,22 +108,32 @@ class SafeSink:
         opened: Callable[[], Sink],
         tell: Callable[[str], None],
     ) -> Self | None:
-        """Return the sink of the viewer's file, or of a viewer on a port; a flight recorder has no
-        such file: `rack replay` makes it of what is kept.
+        """Open the sink for the viewer's file, or for a viewer on a port.
+
+        Args:
+            segment: Segment of the rack.
+            port: Port of the viewer, or None.
+            opened: Opens the sink.
+            tell: Prints a message for the user.
+
+        Returns:
+            The sink. None for a flight recorder without a port, because `rack replay` makes the
+            file of what it kept.
         """
         if port is None and Retention.of(segment) is not None:
             return None
-        # No run waits for the libraries of the viewer, which may take long, and for ever on a full
-        # disk, unless the user wants to look on from the start.
+        # The viewer's libraries may take long to load, or hang on a full disk, so a run does not
+        # wait for them, unless the user wants to watch from the start.
         return cls(opened, tell, port is None)
 
     def add(self, ring: str, rows: np.ndarray) -> None:
-        """Keep rows to be passed on."""
+        """Keep rows until they can be passed on."""
         self._waiting.append(lambda sink: sink.add(ring, rows))
 
     def advance(self, tick: int, lost: Mapping[str, int]) -> None:
-        """Pass on what waits, and the tick. A sink that was opened late is behind, and catches up
-        over several passes.
+        """Pass on what is waiting, and the tick.
+
+        A sink that was opened late catches up over several passes.
         """
         counted = dict(lost)
         self._waiting.append(lambda sink: sink.advance(tick, counted))
@@ -121,7 +142,7 @@ class SafeSink:
         self._late = len(self._waiting)
 
     def close(self, tick: int, lost: Mapping[str, int]) -> None:
-        """Finish the sink, once it is open."""
+        """Finish the sink, waiting for it to open if necessary."""
         self._waiting.append(lambda sink: sink.close(tick, lost))
         until = time.monotonic() + self._patience_s
         idle = IdleLooks(os.getpid())
@@ -136,13 +157,14 @@ class SafeSink:
             self._hand_over()
 
     def hurry(self) -> None:
-        """Do without a sink that will not be open soon."""
+        """Stop waiting for a sink that will not be open soon."""
         self._patience_s = HURRIED_S
         self._why_late = "the run was interrupted before the libraries of the viewer were loaded"
 
     def _hand_over(self, until: float = 0.0) -> None:
-        """Make the calls that wait for the sink, as many as have come and more `until` then; there
-        are none to make of one that has failed.
+        """Make the waiting calls: all new ones, and older ones until the time `until`.
+
+        The calls of a failed sink are dropped.
         """
         while len(self._waiting) > self._late or (self._waiting and time.monotonic() < until):
             call = self._waiting.popleft()
@@ -150,6 +172,7 @@ class SafeSink:
                 self._guarded(partial(call, sink))
 
     def _guarded(self, call: Callable[[], None]) -> None:
+        """Make a call. If it fails, drop the sink and report the error."""
         try:
             call()
         except Exception as error:
@@ -158,14 +181,17 @@ class SafeSink:
 
 
 RISKED_PART = 4
-"""Lockstep may be ahead of the spool's file by one part in so many of the rings."""
+"""Divisor of the rings' length, in ticks.
+
+Lockstep may run ahead of the spool's file by this part of the rings.
+"""
 
 
 class Recorder:
-    """Records one rack into `folder`, in a context: leaving it finishes the files. `view` takes the
-    same rows.
+    """Records one rack into `folder`. A context manager that finishes the files on exit.
 
-    The first recorder of a rack in lockstep is its follower: the clock waits for it.
+    `view` takes the same rows. The first recorder of a rack in lockstep is its follower, for which
+    the clock waits.
     """
 
     def __init__(self, segment: Segment, folder: Path, view: Sink | None = None) -> None:
@@ -174,8 +200,8 @@ class Recorder:
         self._view = view
         self._segment = segment
         self._words = segment.words
-        # The spool first: it fails where another recorder is running, and leaves that one's files
-        # alone.
+        # Open the spool first, since it fails if another recorder is running, whose files must
+        # then not be touched.
         self._spool = Spool(folder, layout, segment.launch)
         write_file(folder / PUBLISHED, segment.published)
         Checksums(folder).store(PUBLISHED)
@@ -195,16 +221,16 @@ class Recorder:
         )
         for name, taken in self._tally.taken.items():
             self._rings[name].resume(taken)
-        # Lockstep has no deadlines that the machine could break.
+        # In lockstep the machine cannot cause a deadline miss.
         self._cores = None if self._words[System.LOCKSTEP] else CoreMeter()
         follower = self._words[System.FOLLOWER_PID]
-        # The clock cannot see a process of another PID namespace, so it does not wait for it.
+        # The clock cannot see a process of another PID namespace, and so cannot wait for it.
         is_visible = bool(segment.launcher)
         is_awaited = is_visible and follower == os.getpid()
         self._is_follower = is_awaited or (is_visible and not is_alive(follower))
-        # All rows up to here are in the spool's file. The launcher's recorder still has to read
-        # those after, even if the one before it died with no row in the file; another one begins
-        # now.
+        # All rows before this tick are in the spool's file. A recorder that the clock waits for
+        # continues where the last one stopped, even if that one died without writing a row. Any
+        # other recorder begins now.
         self._safe_tick = self._words[System.FOLLOWER_TICK if is_awaited else System.TICK]
         self._most_at_risk = round(KEPT_S * 1e9 / layout.clock_ns) // RISKED_PART
         self._report_progress()
@@ -216,7 +242,8 @@ class Recorder:
         if kind is None:
             self.close()
         else:
-            # The tables may lack rows now; the next recorder, or `mend`, makes them from the spool.
+            # The tables may lack rows now. The next recorder, or `rebuild_files`, makes them from
+            # the spool.
             self._spool.close()
 
     def drain(self) -> None:
@@ -232,8 +259,8 @@ class Recorder:
                 self._view.add(name, rows)
         if self._is_follower:
             self._words[System.FOLLOWER_DRAINED] = tick
-        # A killed recorder loses the rows that are not in its file: lockstep must not run far ahead
-        # of it.
+        # A killed recorder loses the rows that are not in its file, so lockstep must not run far
+        # ahead of the file.
         is_late = self._is_follower and tick - self._safe_tick >= self._most_at_risk
         if self._spool.flush(now=is_late):
             self._safe_tick = tick
@@ -246,15 +273,16 @@ class Recorder:
         self._report_progress()
 
     def _report_progress(self) -> None:
-        """In lockstep, tell the clock how far the recording is; reclaim the role of follower, lost
-        after a delay.
+        """Tell the clock in lockstep how far the recording is.
+
+        This also reclaims the role of follower, which a delay may have cost.
         """
         if self._is_follower:
             self._words[System.FOLLOWER_TICK] = self._safe_tick
             self._words[System.FOLLOWER_PID] = os.getpid()
 
     def follow(self, until: int) -> None:
-        """Record until a descriptor is readable or closed."""
+        """Record until a file descriptor is readable or closed."""
         period_s = LOCKSTEP_S if self._words[System.LOCKSTEP] else REALTIME_S
         watched = select.poll()
         watched.register(until, select.POLLIN)
@@ -263,7 +291,7 @@ class Recorder:
         self.drain()
 
     def close(self) -> None:
-        """Finish the files; the rack continues without a follower."""
+        """Finish the files. The rack continues without a follower."""
         if self._is_follower:
             self._words[System.FOLLOWER_PID] = 0
         if self._flight is not None:

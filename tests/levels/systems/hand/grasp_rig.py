@@ -1,4 +1,4 @@
-"""A hand with all of its loops, apart or on one board a finger, and a grasp loop above."""
+"""A hand with all of its loops, on a board per loop or per finger, and a grasp loop above."""
 
 from __future__ import annotations
 
@@ -46,8 +46,10 @@ def program(*steps: Mapping[str, Any]) -> dict[str, Any]:
 
 
 class GraspRig(Lockstep):
-    """Runs a program of a grasp; `boards` are "loops", one for each loop, or "fingers", one for
-    each finger."""
+    """Runs a program of a grasp.
+
+    `boards` is "loops" for a board per loop, or "fingers" for a board per finger.
+    """
 
     def __init__(
         self,
@@ -86,8 +88,7 @@ class GraspRig(Lockstep):
         return self.read("grasp.status")
 
     def go(self, seconds: float, steps: int | None = None) -> bool:
-        """Run until the program has ended, or `steps` of it are done; return False if the time is
-        over before."""
+        """Run until the program has ended, or `steps` of it are done. Returns False on time-out."""
 
         def ended(rack: Lockstep) -> bool:
             hand = rack.read("hand.status")

@@ -1,5 +1,4 @@
-"""A hand whose tendons are driven by test boards: each holds its joints at positions, as a joint
-loop would."""
+"""A hand driven by test boards, which hold its joints at positions like a joint loop."""
 
 from __future__ import annotations
 

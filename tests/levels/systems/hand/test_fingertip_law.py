@@ -1,4 +1,4 @@
-"""The fingers' kinematics, and joint targets for postures, points and forces of fingers."""
+"""Kinematics of the fingers, and joint targets for postures, points and forces."""
 
 from __future__ import annotations
 
@@ -24,8 +24,7 @@ def the_kinematics() -> FingerKinematics:
 
 
 class Tips:
-    """The law of all fingers; the joints are always where their targets are, unless `sensed` is
-    set."""
+    """The law of all fingers. Joints are always at their targets, unless `sensed` is set."""
 
     def __init__(self) -> None:
         self.law = FingertipLaw(the_kinematics(), range(4), FingertipGains(), PERIOD_S)

@@ -1,5 +1,7 @@
-"""A grasp by all loops of a hand: takes an object, keeps it while it is pulled and boards die, and
-lets it go."""
+"""A grasp by all loops of a hand: it takes an object, keeps it and releases it.
+
+It keeps the object while the object is pulled and boards die.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""The board of a hand: driven by the tensions of one board or of four, and what it does without
-them."""
+"""The board of a hand, driven by one board, by four, or by none."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""The law of the tendons: no tension below the least, torques within reach, and valves that lag and
-err."""
+"""The law of the tendons: least tensions, torque limits, and valves that lag and err."""
 
 from __future__ import annotations
 
@@ -28,8 +27,7 @@ def the_hand() -> Hand:
 
 
 class Valves:
-    """Valves of all tendons: gain, offset and lag; what the hand senses is a cycle old when it is
-    read."""
+    """Valves of all tendons with gain, offset and lag. Sensed tensions are a cycle old."""
 
     def __init__(self, gain: float = 1.0, offset: float = 0.0, gains: TendonGains = EXACT) -> None:
         self.hand, self._gain, self._offset = the_hand(), gain, offset
@@ -112,7 +110,7 @@ def test_lasting_errors_of_valves_are_learned_and_the_least_tension_is_kept(
     valves.run(torque, 3.0)
     assert valves.torque == pytest.approx(torque, rel=1e-3)
     assert valves.tension.min() >= valves.hand.least
-    # With a larger torque, a gain's error is learned anew.
+    # With a larger torque, the error of a gain is learned again.
     valves.run(-2.0 * torque, 3.0)
     assert valves.torque == pytest.approx(-2.0 * torque, rel=1e-3)
 
@@ -128,7 +126,7 @@ def test_valves_that_are_closed_teach_nothing() -> None:
         valves.status.tension += 0.1
         valves.law.set_tensions(valves.status, torque, valves.wanted)
     assert valves.wanted == pytest.approx(before)
-    # Nor does a sensor that gives no number.
+    # A sensor that returns NaN must not change the trim either.
     valves.status.holding, valves.status.tension[0, 0] = 0, math.nan
     valves.status.tick += EVERY
     valves.law.set_tensions(valves.status, np.zeros(16), valves.wanted)

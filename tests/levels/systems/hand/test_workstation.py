@@ -1,4 +1,4 @@
-"""The workstation of a hand, on a bus of the test: when it plans, and what it sends."""
+"""The workstation of a hand on a simulated bus: when it plans, and what it sends."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Received:
 
 
 class Sent:
-    """An output of a program, whose messages the test looks at."""
+    """An output of a program, whose messages the test reads."""
 
     def __init__(self) -> None:
         self.message = GraspPlan.zeros(SIZES)
@@ -44,7 +44,7 @@ class Sent:
 
 
 class Crate:
-    """A bus, and the ports of a `Workstation` on it. A second passes between two looks."""
+    """A bus, and the ports of a `Workstation` on it. Each wait takes a second."""
 
     tasks = ("coordinator",)
     tick = 12
@@ -98,7 +98,7 @@ def workstation(**params: Any) -> Workstation:
 
 
 @pytest.mark.slow
-def test_it_plans_once_and_anew_when_the_object_moves_before_it_is_held() -> None:
+def test_it_plans_once_and_again_if_the_object_moves_before_it_is_held() -> None:
     crate, host = Crate(), workstation()
     crate.connect(host)
     host.run(crate)  # type: ignore[arg-type]
