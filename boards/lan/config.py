@@ -1,6 +1,4 @@
-"""`[adapter.lan]`: what a rack exchanges with others over a network, with whom, and by which
-rules.
-"""
+"""Tables of `[adapter.lan]`: exports, imports, other racks and the rules of access."""
 
 from __future__ import annotations
 
@@ -15,9 +13,9 @@ from rack.levels.references import module_and_name
 from rack.levels.tables import Positive, Table
 
 FASTEST_HZ = 50.0
-"""Fastest exchange over a network."""
+"""Highest rate of an exchange over a network."""
 MOST_CHAIN = 8192
-"""Bytes of a rack's certificates in DER form, as they travel with its seals."""
+"""Maximum size of a rack's certificates in DER form, bytes. They are sent with every seal."""
 MessageKind = type[Message]
 OnPeerLoss = Literal["hold", "stop", "go on"]
 PeerName = Annotated[str, StringConstraints(pattern=f"^{RACK_NAME}$")]
@@ -33,7 +31,12 @@ ENDPOINT_NOTE = (
 
 
 class Credential(Exception):
-    """A file of `certificates` that cannot be used: its path, and why."""
+    """A credential file that cannot be used.
+
+    Attributes:
+        path: Path of the file.
+        why: What is wrong with it.
+    """
 
     def __init__(self, path: Path, why: str) -> None:
         super().__init__(f"{path}: {why}")
@@ -51,9 +54,7 @@ class ExportConfig(Table):
 
 
 class ImportConfig(Table):
-    """`[adapter.lan.import.<port>]`: one mailbox of another rack, which levels here read as
-    `lan.<port>`.
-    """
+    """`[adapter.lan.import.<port>]`: a mailbox of another rack, read by levels as `lan.<port>`."""
 
     source: Remote = Field(alias="from")
     """rack and mailbox, as in cell/task.orders"""
@@ -66,26 +67,31 @@ class ImportConfig(Table):
 
     @property
     def rack(self) -> str:
-        """Name of the rack that writes it."""
+        """Name of the rack that writes the mailbox."""
         return self.source.partition("/")[0]
 
     @property
     def mailbox(self) -> str:
-        """Name of the mailbox there."""
+        """Name of the mailbox in that rack."""
         return self.source.partition("/")[2]
 
     def message_class(self) -> MessageKind:
-        """Return the message class. Raises `LookupError` with the reason if there is none."""
+        """Import the message class.
+
+        Raises:
+            LookupError: The module or the class does not exist, or the class is not a message.
+        """
         module, name = module_and_name(self.type)
-        found = getattr(module, name, None)
-        if not (isinstance(found, type) and issubclass(found, Message)):
+        message_class = getattr(module, name, None)
+        if not (isinstance(message_class, type) and issubclass(message_class, Message)):
             raise LookupError(f"module '{module.__name__}' has no message class '{name}'")
-        return found
+        return message_class
 
 
 class LanTable(Table):
-    """The keys of `[adapter.lan]` that concern the network; those of its board are declared with
-    the boards'.
+    """Keys of `[adapter.lan]` that concern the network.
+
+    The keys of its board are declared with the boards.
     """
 
     listen: tuple[str, ...] = Field(
@@ -120,5 +126,5 @@ class LanTable(Table):
 
     @property
     def racks(self) -> tuple[str, ...]:
-        """The racks with which this one works: those from which it imports, and `peers`."""
+        """Names of the racks with which this rack works: the ones it imports from, and `peers`."""
         return tuple(dict.fromkeys([*(entry.rack for entry in self.imports.values()), *self.peers]))

@@ -1,6 +1,4 @@
-"""The status of the network adapter: what it counts of each export and import, and of everything
-else that came over the network.
-"""
+"""Status message of the network adapter, with counters of exports, imports and refusals."""
 
 from __future__ import annotations
 
@@ -16,9 +14,10 @@ C = TypeVar("C", bound=Message)
 
 
 def zero_counts(group: type[C]) -> C:
-    """Return the counts of a group of a status, all 0.
+    """Return a group of counters with all values 0.
 
-    Its integers are wider than those of the status, so that none overflows: see `fill_counts`.
+    Its integers are 64 bits wide, so that they cannot overflow before `fill_counts` limits them to
+    the width of the status.
     """
     fields = group.message_type.fields
     return group(np.dtype([(f.name, "f8" if f.python is float else "i8") for f in fields]))
@@ -88,7 +87,7 @@ class LanDesk(Message, version=1):
 
 
 def status_of(exports: Iterable[str], imports: Iterable[str]) -> type[Status]:
-    """Return the class of an adapter's status: a group for each export and import."""
+    """Build the message class of an adapter's status, with a group for each export and import."""
     groups = {
         "clocks": field(LanClocks, doc="round trips to compare clocks; none in lockstep"),
         **{f"export_{port}": field(LanExport, doc=f"export {port}") for port in exports},

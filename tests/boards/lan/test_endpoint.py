@@ -35,7 +35,7 @@ def test_an_endpoint_has_a_protocol_a_host_and_a_port(
     ],
 )
 def test_what_is_none_is_refused(text: str) -> None:
-    with pytest.raises(ValueError, match="permitted: tcp/, tls/ or quic/"):
+    with pytest.raises(ValueError, match="must be tcp/, tls/ or quic/"):
         Endpoint.of(text)
 
 

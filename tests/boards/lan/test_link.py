@@ -72,7 +72,7 @@ def test_a_unix_socket_is_reached_by_its_own_user_alone(
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700
     for mode in (0o710, 0o702):
         folder.chmod(mode)
-        with pytest.raises(LevelError, match="others may enter it"):
+        with pytest.raises(LevelError, match="others can access it"):
             LanLink("cell", LanTable(listen=("unix/cell",)))
 
 

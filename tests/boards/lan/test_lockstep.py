@@ -151,9 +151,12 @@ def test_racks_wait_for_each_other_and_a_stop_ends_the_wait(
     with running(racks[:1]) as (rack,):
         rack.start(1.0)
         watch([rack], until=lambda: rack.segment.block("lan")[Block.AWAITS])
-        said = f"waits for rack '{names[1]}': it has not come yet, or does not name this rack"
+        reason = (
+            f"waits for rack '{names[1]}': it has not connected yet,"
+            " or its config does not name this rack"
+        )
         assert [hold.why for hold in find_holds(Newest(rack.segment)) if hold.level == "lan"] == [
-            said
+            reason
         ]
         watch([rack], until=lambda: rack.events[-1].kind == "waiting")
         assert rack.segment.words[System.TICK] < CYCLE
@@ -166,7 +169,10 @@ def test_racks_wait_for_each_other_and_a_stop_ends_the_wait(
 @pytest.mark.parametrize(
     ("setting", "text"),
     [
-        ("adapter.lan.rate_hz=100", "cycles of adapter.lan differ: 10 ms in rack '{}', 20 ms here"),
+        (
+            "adapter.lan.rate_hz=100",
+            "cycles of adapter.lan differ: 10 ms in rack '{}', 20 ms in this rack",
+        ),
         ("clock.mode=realtime", "rack '{}' runs in real time, this one in lockstep"),
     ],
 )

@@ -71,7 +71,7 @@ def test_a_set_that_is_not_whole_or_whose_file_never_ends_is_not_added_to(
 ) -> None:
     rack("lan", "certificates", tmp_path, "--for", "cell")
     (tmp_path / name).unlink()
-    lacking = "missing; see rack lan certificates --help"
+    lacking = "the file is missing; see rack lan certificates --help"
     for why in (lacking, "cannot be read: not a regular file, but a FIFO"):
         done = rack("lan", "certificates", tmp_path, "--for", "puma")
         assert (done.returncode, done.stderr) == (2, f"{tmp_path / name}: {why}\n")

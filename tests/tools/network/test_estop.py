@@ -248,7 +248,7 @@ def test_a_host_that_cannot_be_reached_is_one_line(tmp_path: Path) -> None:
             "estop 127.0.0.1/x --as X!",
             f"estop 127.0.0.1:{open_port}/x --certificates {tmp_path}/certs --as stranger",
         )
-    missing = f"{tmp_path}/certs/stranger.pem: missing; see rack lan certificates --help"
+    missing = f"{tmp_path}/certs/stranger.pem: the file is missing; see rack lan certificates --help"
     assert [one.err.strip() for one in ended] == [
         f"127.0.0.1:{port}: cannot connect to port {port}: Connection refused",
         f'RACK = "127.0.0.1:99999/x": {why}',
