@@ -1,4 +1,4 @@
-"""`rack lan`: what racks on a network need before they run."""
+"""`rack lan`: preparation of racks for a network."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ YEAR = 365
 
 @app.callback()
 def lan() -> None:
-    """Prepare racks that work together over a network."""
+    """Prepare racks for working together over a network."""
 
 
 @app.command()

@@ -74,13 +74,13 @@ def test_a_kind_of_a_users_own_acts_and_is_detected(config: MakeConfig) -> None:
 
 
 def test_two_kinds_of_one_name_are_refused() -> None:
-    with pytest.raises(ValueError, match="kind 'kill': already taken by 'kill'"):
+    with pytest.raises(ValueError, match="kind 'kill' has the number of 'kill'; rename it"):
         KINDS.add(Kind("kill", "process", "", (), cycles(1)))
 
 
 def test_a_kind_has_no_more_parameters_than_an_entry_of_the_fault_table_holds() -> None:
     nine = tuple(Parameter(f"p{at}", "1", "a number", 0, 0, 1) for at in range(9))
-    with pytest.raises(ValueError, match="kind 'many': 9 parameters; permitted: 8"):
+    with pytest.raises(ValueError, match="kind 'many' has 9 parameters; at most 8 are allowed"):
         KINDS.add(Kind("many", "process", "", (), cycles(1), parameters=nine))
 
 

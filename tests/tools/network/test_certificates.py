@@ -94,7 +94,7 @@ BAD = {
     **dict.fromkeys(("authority", "cell-key"), "a file of the set would have this name"),
     **dict.fromkeys(
         ("cell=", "cell=10.0.0.1,", "cell=300.0.0.1", "cell=*.local", "cell=10.0.0.1:7447"),
-        "permitted: NAME, or NAME=ADDRESS",
+        "it must be NAME or NAME=ADDRESS",
     ),
 }
 

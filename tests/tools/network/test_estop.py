@@ -248,7 +248,9 @@ def test_a_host_that_cannot_be_reached_is_one_line(tmp_path: Path) -> None:
             "estop 127.0.0.1/x --as X!",
             f"estop 127.0.0.1:{open_port}/x --certificates {tmp_path}/certs --as stranger",
         )
-    missing = f"{tmp_path}/certs/stranger.pem: the file is missing; see rack lan certificates --help"
+    missing = (
+        f"{tmp_path}/certs/stranger.pem: the file is missing; see rack lan certificates --help"
+    )
     assert [one.err.strip() for one in ended] == [
         f"127.0.0.1:{port}: cannot connect to port {port}: Connection refused",
         f'RACK = "127.0.0.1:99999/x": {why}',
@@ -262,6 +264,6 @@ def test_another_machine_is_not_asked_without_certificates(monkeypatch: pytest.M
     monkeypatch.setattr(socket.socket, "getpeername", lambda self: ("192.0.2.7", 7447))
     with (
         socket.create_server(("127.0.0.1", 0)) as server,
-        pytest.raises(Failure, match="not this machine, so it needs certificates"),
+        pytest.raises(Failure, match="is another machine, so a stop needs certificates"),
     ):
         check_reach(RackAddress("127.0.0.1", server.getsockname()[1], "cell"), Operator())
