@@ -93,7 +93,7 @@ def explains(strike: Strike, event: Event) -> bool:
     """Return True if an event during a fault may be its detection or a consequence of its kind."""
     consequence = strike.record.consequence
     if event.kind == "miss":
-        # A fault that takes one task's cycles may take those of any task on its core.
+        # A fault that takes one task's cycles may take cycles of any task on the same core.
         return takes_cycles(strike)
     if event.kind == DIED:
         return strike.board == event.board and consequence.ends_process

@@ -27,7 +27,7 @@ def test_a_set_is_made_for_every_name_and_only_its_owner_may_read_it(tmp_path: P
     assert list(Credentials(folder, "cell").flaws(["10.0.0.1", "cell.local"])) == []
     assert list(Credentials(folder, "operator").flaws()) == []
     assert "A set for tests" in done.stdout
-    assert "Each machine needs only authority.pem and its own pair" in done.stdout
+    assert "Each machine needs only authority.pem and one pair" in done.stdout
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700
     assert {stat.S_IMODE(path.stat().st_mode) for path in folder.iterdir()} == {0o600}
 

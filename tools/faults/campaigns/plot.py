@@ -1,4 +1,4 @@
-"""A campaign as a picture, campaign.png. Imports matplotlib: see `rack.tools.console.pictures`."""
+"""A campaign as a chart, campaign.png. Imports matplotlib: see `rack.tools.console.pictures`."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ SIZE_IN = (13.0, 8.0)
 DOT = "#4477aa"
 MIDDLE = "#222222"
 BOUND = "#cc3311"
-"""Colours that people with any kind of colour vision can distinguish (Paul Tol's)."""
+"""Colours that are distinguishable with any kind of colour vision (Paul Tol)."""
 WIDEST = 1.5
-"""Part of a bound up to which delays are drawn; later ones are arrows at the edge."""
+"""Fraction of a bound up to which delays are drawn. Later ones are arrows at the edge."""
 
 
 def plot(report: CampaignReport, path: Path) -> None:
@@ -39,9 +39,8 @@ def plot(report: CampaignReport, path: Path) -> None:
 
 
 def _places(figure: Figure) -> Iterator[SubplotSpec]:
-    """Yield the places of the three drawings: one on the left, two on the right."""
-    # Fixed: the numbers next to the left one and the names of kinds need their room whatever is
-    # drawn.
+    """Yield the places of the three charts: one on the left, two on the right."""
+    # Fixed margins: the numbers beside the left chart and the names of kinds always need room.
     grid = figure.add_gridspec(
         2,
         2,
@@ -57,18 +56,19 @@ def _places(figure: Figure) -> Iterator[SubplotSpec]:
 
 
 def _delays(axes: Axes, report: CampaignReport) -> None:
-    """Draw each fault's time to detection as a part of its own bound; note median and longest in
-    cycles.
+    """Draw the detection delay of each fault as a fraction of its bound.
+
+    The median and the maximum of each kind are written beside it, in cycles.
     """
     kinds = list(report.by_kind)[::-1]
     for row, kind in enumerate(kinds):
         found = [fault for fault in report.faults_of(kind) if fault.seen == "detected"]
-        parts = [part for part in map(_part, found) if part is not None]
-        _row(axes, row, [part for part in parts if part <= WIDEST])
-        late = sum(part > WIDEST for part in parts)
+        fractions = [part for part in map(_part, found) if part is not None]
+        _row(axes, row, [part for part in fractions if part <= WIDEST])
+        late = sum(part > WIDEST for part in fractions)
         axes.scatter([WIDEST] * late, [row] * late, marker=">", s=40, color=BOUND, clip_on=False)
-        if parts:
-            axes.scatter([min(WIDEST, median(parts))], [row], marker="|", s=180, color=MIDDLE)
+        if fractions:
+            axes.scatter([min(WIDEST, median(fractions))], [row], marker="|", s=180, color=MIDDLE)
         figures = report.by_kind[kind]
         numbers = f"{figures.detected} of {figures.injected}"
         if figures.cycles is not None:
@@ -83,19 +83,22 @@ def _delays(axes: Axes, report: CampaignReport) -> None:
 
 
 def _row(axes: Axes, row: int, values: list[float]) -> None:
+    """Draw values as dots in a row."""
     axes.scatter(
         values, [row] * len(values), s=26, color=DOT, alpha=0.4, linewidths=0, clip_on=False
     )
 
 
 def _name_rows(axes: Axes, names: list[str]) -> None:
+    """Write names beside the rows."""
     axes.set_yticks(range(len(names)), names, fontsize=8)
     axes.set_ylim(-0.7, max(0, len(names) - 1) + 0.7)
 
 
 def _part(fault: Judgement) -> float | None:
-    """Return a fault's delay as a part of its bound; a bound of the same cycle is met exactly or
-    not at all.
+    """Return the delay of a fault as a fraction of its bound.
+
+    A bound of 0, the same cycle, is either met exactly or exceeded.
     """
     if fault.bound == 0 and fault.bound_ms is None:
         return 0.0 if fault.delay == 0 else 2 * WIDEST
@@ -103,7 +106,7 @@ def _part(fault: Judgement) -> float | None:
 
 
 def _sizes(axes: Axes, report: CampaignReport) -> None:
-    """Draw the size of a sensor's error against the time to its detection."""
+    """Draw the size of sensor errors against the delay of their detection."""
     edge = axes.get_xaxis_transform()
     longest = 10 * report.clock_ms
     for (kind, found), marker in zip(report.curves.items(), "os", strict=False):
@@ -118,18 +121,20 @@ def _sizes(axes: Axes, report: CampaignReport) -> None:
     if report.curves:
         axes.set_xscale("log")
         axes.xaxis.set_minor_formatter(NullFormatter())
-        # Linear up to a tick: most delays are 0.
+        # Use a linear scale up to one tick, because most delays are 0.
         axes.set_yscale("symlog", linthresh=report.clock_ms)
         axes.set_ylim(-0.5 * report.clock_ms, 1.5 * longest)
         axes.legend(fontsize=8)
     else:
         axes.text(0.5, 0.5, "no size was tried", ha="center", transform=axes.transAxes)
-    axes.set_xlabel("size of the error, rad (dotted: must be found from there; x: not found)")
+    axes.set_xlabel(
+        "size of the error, rad (dotted: smallest that must be detected; x: not detected)"
+    )
     axes.set_ylabel("time to detection, ms")
 
 
 def _recoveries(axes: Axes, report: CampaignReport) -> None:
-    """Draw the time from each strike until every reaction was undone."""
+    """Draw the time from each fault until every reaction was undone."""
     kinds: list[str] = []
     for kind in reversed(report.by_kind):
         ticks = [fault.recovery for fault in report.faults_of(kind) if fault.recovery is not None]

@@ -136,7 +136,7 @@ def test_what_did_not_strike_is_drawn_again_and_in_the_end_said(make: MakeCampai
     # Each round more of them, up to four of each that is missing.
     again = sum(min(turn + 1, module.MOST_AGAIN) for turn in range(1, module.ROUNDS))
     assert (kinds.count("mute"), kinds.count("drop")) == (3 + 3 * again, 3)
-    assert results.lacking == [f"mute: struck 0 of 3 times, in {module.ROUNDS} rounds"]
+    assert results.lacking == [f"mute acted only 0 of 3 times in {module.ROUNDS} rounds"]
 
 
 def test_trials_that_are_kept_are_not_made_again(make: MakeCampaign) -> None:
@@ -169,7 +169,7 @@ def test_it_is_the_same_campaign_whichever_way_its_trials_are_made(make: MakeCam
 
 def test_a_folder_of_another_campaign_is_refused(make: MakeCampaign) -> None:
     make()[0].run()
-    with pytest.raises(Failure, match="holds another campaign; it differs in seed") as caught:
+    with pytest.raises(Failure, match="has another campaign, which differs in seed") as caught:
         make(seed=6)[0].run()
     assert caught.value.status == 2
 

@@ -139,10 +139,14 @@ def _lasts(table: Mapping[str, Any]) -> int:
 @pytest.mark.parametrize(
     ("wanted", "lockstep", "why"),
     [
-        ("kill,murder", False, "--kinds murder: no such kind; kinds: kill, hang, "),
-        ("lock-held", False, "--kinds lock-held: nothing in this rack can have it; kinds: "),
-        ("hog", True, "--kinds hog: hog needs real time, and the campaign is in lockstep; kinds: "),
-        (" , ", False, "--kinds: names no kind; kinds: "),
+        ("kill,murder", False, "--kinds murder: there is no such kind; valid kinds: kill, hang, "),
+        ("lock-held", False, "--kinds lock-held: nothing in this rack can have it; valid kinds: "),
+        (
+            "hog",
+            True,
+            "--kinds hog: hog needs real time, and the campaign is in lockstep; valid kinds: ",
+        ),
+        (" , ", False, "--kinds names no kind; valid kinds: "),
     ],
 )
 def test_a_kind_that_cannot_be_is_refused_in_one_line(

@@ -156,7 +156,7 @@ def test_the_text_says_what_the_document_holds(made: CampaignReport) -> None:
 def test_a_campaign_without_shortfalls_has_passed() -> None:
     text = report_of(Results(RUN, is_interrupted=True)).markdown()
     assert text.startswith("# Campaign on small, seed 9: passed\n")
-    assert "Interrupted: results until then." in text
+    assert "The campaign was interrupted." in text
     assert not any(
         word in text for word in ("Shortfalls", "Faults by kind", "Faultless", "of these without")
     )
