@@ -99,7 +99,8 @@ def swept(least: float, visible: float, count: int) -> list[float]:
 
     Args:
         least: Smallest size.
-        visible: Smallest size that must be detected. The series ends at `MAX_SIZE_RATIO` times this size.
+        visible: Smallest size that must be detected. The series ends at `MAX_SIZE_RATIO` times this
+            size.
         count: Number of sizes.
     """
     ratio = BEYOND * visible / least

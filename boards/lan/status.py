@@ -27,7 +27,7 @@ class LanExport(Message, version=1):
     """Counts of one export, in the status of the network adapter."""
 
     sent: int = counter("messages sent")
-    serial: int = field(unit="1", doc="serial of the newest message sent; 0: none")
+    serial: int = field(unit="1", doc="serial of the newest message sent, 0 if there is none")
 
 
 class LanImport(Message, version=1):
@@ -45,24 +45,26 @@ class LanImport(Message, version=1):
     superseded: int = counter("messages that a newer one overtook before the exchange")
     launch: int = field(
         unit="1",
-        doc="number of the launch that wrote the newest message taken; 0: none, or in lockstep",
+        doc="launch that wrote the newest message taken, 0 if there is none or in lockstep",
     )
     number: int = field(unit="1", doc="number of that message among those sent from its mailbox")
-    serial: int = field(unit="1", doc="its serial in its mailbox; 0: none")
-    age: int = field(unit="tick", doc="age of its information in this rack's ticks; -1: none yet")
-    age_s: float = field(unit="s", doc="the same in simulated time; -1: none yet")
+    serial: int = field(unit="1", doc="its serial in its mailbox, 0 if there is none")
+    age: int = field(
+        unit="tick", doc="age of its information in this rack's ticks, -1 if there is none"
+    )
+    age_s: float = field(unit="s", doc="the same in simulated time, -1 if there is none")
 
 
 class LanFlaws(Message, version=1):
     """Counts of what came over the network and was dropped unread, by cause."""
 
     malformed: int = counter(
-        "not of this protocol, or of another version of it; in lockstep always 0"
+        "not of this protocol or of another version of it, always 0 in lockstep"
     )
     unsigned: int = counter(
-        "changed on the way, under another key, or not sealed by whom it names; likewise"
+        "changed on the way, under another key or not sealed by its sender, always 0 in lockstep"
     )
-    oversized: int = counter("longer than most_bytes; likewise")
+    oversized: int = counter("longer than most_bytes, always 0 in lockstep")
 
 
 class LanClocks(Message, version=1):
@@ -80,10 +82,14 @@ class LanDesk(Message, version=1):
     """Counts of the emergency stops that other machines asked for."""
 
     answered: int = counter(
-        "emergency stops from other machines that were set; in lockstep always 0"
+        "emergency stops from other machines that were set, always 0 in lockstep"
     )
-    refused: int = counter("emergency stops refused: not permitted; likewise")
-    dropped: int = counter("requests dropped: malformed, unsigned or oversized; likewise")
+    refused: int = counter(
+        "emergency stops refused because they are not permitted, always 0 in lockstep"
+    )
+    dropped: int = counter(
+        "requests dropped: malformed, unsigned or oversized, always 0 in lockstep"
+    )
 
 
 def status_of(exports: Iterable[str], imports: Iterable[str]) -> type[Status]:

@@ -26,7 +26,7 @@ def test_a_set_is_made_for_every_name_and_only_its_owner_may_read_it(tmp_path: P
     assert sorted(path.name for path in folder.iterdir()) == sorted(names)
     assert list(Credentials(folder, "cell").flaws(["10.0.0.1", "cell.local"])) == []
     assert list(Credentials(folder, "operator").flaws()) == []
-    assert "A set for tests" in done.stdout
+    assert "This set is for tests" in done.stdout
     assert "Each machine needs only authority.pem and one pair" in done.stdout
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700
     assert {stat.S_IMODE(path.stat().st_mode) for path in folder.iterdir()} == {0o600}
@@ -90,7 +90,7 @@ def test_another_key_does_not_sign_for_the_authority(tmp_path: Path) -> None:
 
 
 BAD = {
-    **dict.fromkeys(("Cell", "", "../cell"), "permitted names"),
+    **dict.fromkeys(("Cell", "", "../cell"), "a name consists of"),
     **dict.fromkeys(("authority", "cell-key"), "a file of the set would have this name"),
     **dict.fromkeys(
         ("cell=", "cell=10.0.0.1,", "cell=300.0.0.1", "cell=*.local", "cell=10.0.0.1:7447"),
