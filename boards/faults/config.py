@@ -50,7 +50,7 @@ class FaultConfig(Table):
     kind: str
     """kind of fault; 'rack inject --help' lists the kinds"""
     board: str
-    """task to strike: a board (servo), its planner (servo.planner), or clock"""
+    """affected task: a board (servo), its planner (servo.planner), or clock"""
     tick: Tick | None = None
     """first tick; give at most one of tick, at, when; default: the first of the run"""
     at: Moment | None = None
@@ -62,7 +62,7 @@ class FaultConfig(Table):
     cycles: int | None = Field(None, ge=1, le=10**6)
     """instead of for: duration in cycles of the task"""
     phase: float = Field(0.0, ge=0, lt=1)
-    """fraction of the first tick that passes before it strikes; real time only"""
+    """fraction of the first tick that passes before it acts; real time only"""
     mailbox: str | None = None
     """mailbox to affect; default: all that the task writes; for masquerade, the first"""
     seed: int | None = Field(None, ge=0, le=2**31 - 1)

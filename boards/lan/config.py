@@ -103,22 +103,21 @@ class LanTable(Table):
     insecure: bool = False
     """permit endpoints without TLS beyond loopback, or without certificates on it"""
     lease_ms: float = Field(500.0, ge=20, le=60_000)
-    """real time of silence from which a peer is lost, ms"""
+    """real time without a sign of life after which a peer counts as lost, ms"""
     on_peer_loss: OnPeerLoss = "hold"
-    """while a rack that was there is lost: hold: levels find what it writes lost at once, and hold,
-    until its first message after that; stop: the same, and the arm ramps to rest, then brakes,
-    until it is back; go on: levels keep its last message, however old"""
+    """reaction to the loss of a peer; hold: levels find its mailboxes lost at once and hold until
+    its next message; stop: in addition, the arm ramps to rest and brakes until the peer is back;
+    go on: levels keep its last message, however old"""
     peers: tuple[PeerName, ...] = ()
-    """racks with which this one works, besides those from which it imports: they may import, and
+    """racks with which this one works, besides the ones from which it imports; they may import, and
     lockstep waits for them"""
     launch: tuple[str, ...] = ()
-    """configs of racks that `rack run` launches with this one, on this machine; each in a process
-    of its own"""
+    """configs of racks that `rack run` also launches on this machine, each in a separate process"""
     estop_from: tuple[PeerName, ...] = ()
     """names, proved by certificates, that may set the emergency stop from another machine, with
     rack estop HOST/RACK"""
     most_bytes: int = Field(16_384, ge=64, le=1 << 20)
-    """length of the longest message taken; bytes"""
+    """length of the longest message that is accepted, bytes"""
     exports: dict[PortName, ExportConfig] = Field({}, alias="export")
     """mailboxes that others may import"""
     imports: dict[PortName, ImportConfig] = Field({}, alias="import")
