@@ -89,7 +89,7 @@ def condition(text: str, layout: Layout) -> tuple[int, int, int]:
         raise LookupError(
             'must be mailbox.field == value, as in "elemental_move.status.verb == grasp"'
         )
-    mailboxes = {mailbox.name: at for at, mailbox in enumerate(layout.mailboxes)}
+    mailboxes = {mailbox.name: index for index, mailbox in enumerate(layout.mailboxes)}
     if match[1] not in mailboxes:
         raise LookupError(f"no mailbox '{match[1]}'; mailboxes: {', '.join(mailboxes)}")
     mailbox = layout.mailboxes[mailboxes[match[1]]]

@@ -16,7 +16,9 @@ ALL_JOINTS = "all joints"
 
 def board_of(entry: FaultEntry, layout: Layout) -> str:
     """Return the name of the task that a fault affects, or "clock"."""
-    return CLOCK if (at := entry.task) < 0 else pick(layout.processes, at, "task").name
+    return (
+        CLOCK if (task_index := entry.task) < 0 else pick(layout.processes, task_index, "task").name
+    )
 
 
 def subject_of(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> str:
@@ -56,9 +58,9 @@ def document(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> dict[s
     """
     kind = kind_of(entry)
     stage = as_named(Stage, entry.stage)
-    until = None
+    until_tick = None
     if stage in (Stage.ACTIVE, Stage.OVER) and entry.until != NEVER:
-        until = entry.until
+        until_tick = entry.until
     return {
         "fault": entry.index,
         "kind": kind.name,
@@ -68,7 +70,7 @@ def document(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> dict[s
         "text": describe(entry, layout, joints),
         "stage": stage.name.lower(),
         "begins": entry.tick,
-        "until": until,
+        "until": until_tick,
         "ticks": entry.ticks,
         "struck_tick": entry.struck_tick,
         "acted": entry.count,

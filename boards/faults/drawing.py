@@ -104,7 +104,7 @@ def swept(least: float, visible: float, count: int) -> list[float]:
         count: Number of sizes.
     """
     ratio = BEYOND * visible / least
-    return [_short(least * ratio ** (place / max(1, count - 1))) for place in range(count)]
+    return [_short(least * ratio ** (index / max(1, count - 1))) for index in range(count)]
 
 
 def _short(value: float) -> float:

@@ -114,10 +114,10 @@ class Delay(MessageStep):
     def flush(self, tick: int, visible_at: int) -> None:
         """Pass on the messages whose delay is over."""
         delay_ticks = round(self.entry.parameters[0]) * self.writer.spec.every
-        due = [held for held in self.held if held.at + delay_ticks <= tick]
+        due = [message for message in self.held if message.at + delay_ticks <= tick]
         self.held = self.held[len(due) :]
-        for held in due:
-            self.onward(held._replace(at=tick, visible_at=visible_at))
+        for message in due:
+            self.onward(message._replace(at=tick, visible_at=visible_at))
 
 
 class Reorder(MessageStep):
@@ -127,8 +127,8 @@ class Reorder(MessageStep):
         """Pass the message on before the one held back, or hold it back at random."""
         if self.held:
             self.onward(message)
-            held = self.held.pop()
-            self.onward(held._replace(at=message.at, visible_at=message.visible_at))
+            held_message = self.held.pop()
+            self.onward(held_message._replace(at=message.at, visible_at=message.visible_at))
         elif self.chance(message).random() < self.entry.parameters[0]:
             self.acts(message)
             self.hold(message)
@@ -244,10 +244,10 @@ class FaultyWriter:
     def flush(self, tick: int, now: int | None = None) -> None:
         """Publish the delayed messages that are due at `tick`."""
         visible_at = self._writer.visible_at(tick, now)
-        late = self._late
+        late_messages = self._late
         self._late = []
-        for held in late:
-            self._publish(held._replace(at=tick, visible_at=visible_at))
+        for message in late_messages:
+            self._publish(message._replace(at=tick, visible_at=visible_at))
         for step in self._steps.values():
             step.flush(tick, visible_at)
         self._show()

@@ -159,8 +159,8 @@ class TaskFaults:
 
     def count(self, acted: Mapping[int, bool], tick: int) -> None:
         """Record which faults of the arm acted in a cycle: see `Executor.acted`."""
-        for place, shows in acted.items():
-            self._arm[place].acted(tick, shows)
+        for index, shows in acted.items():
+            self._arm[index].acted(tick, shows)
 
 
 def take_core(segment: Segment, entry: FaultEntry) -> None:

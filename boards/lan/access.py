@@ -116,14 +116,14 @@ def _configured(by_subject: dict[str, list[Rule]]) -> dict[str, Any]:
         "default_permission": "deny",
         "rules": [
             {
-                "id": f"{subject}-{at}",
+                "id": f"{subject}-{index}",
                 "permission": "allow",
                 "flows": [flow],
                 "messages": list(messages),
                 "key_exprs": list(keys),
             }
             for subject, allowed in by_subject.items()
-            for at, (flow, messages, keys) in enumerate(allowed)
+            for index, (flow, messages, keys) in enumerate(allowed)
         ],
         "subjects": [
             {"id": subject}
@@ -132,7 +132,10 @@ def _configured(by_subject: dict[str, list[Rule]]) -> dict[str, Any]:
             for subject in by_subject
         ],
         "policies": [
-            {"rules": [f"{subject}-{at}" for at in range(len(allowed))], "subjects": [subject]}
+            {
+                "rules": [f"{subject}-{index}" for index in range(len(allowed))],
+                "subjects": [subject],
+            }
             for subject, allowed in by_subject.items()
         ],
     }

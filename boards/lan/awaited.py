@@ -59,11 +59,11 @@ def awaited(segment: Segment) -> Iterator[tuple[str, str]]:
             # Imported late because the import is slow and most racks have no network.
             from rack.boards.lan.config import LanTable
 
-            why, place = divmod(word - 1, 1 << _PLACES)
+            why, index = divmod(word - 1, 1 << _PLACES)
             table = load_toml(segment.config).get("adapter", {}).get(task.board)
             if table is None:
                 raise DamageError(f"'{task.board}' waits for another rack and is no adapter")
             keys = {field.alias or name for name, field in LanTable.model_fields.items()}
             racks = LanTable.model_validate({key: table[key] for key in keys & table.keys()}).racks
-            rack = pick(racks, place, "rack")
+            rack = pick(racks, index, "rack")
             yield task.board, f"waits for rack '{rack}': {_TEXTS[as_named(Why, why)]}"

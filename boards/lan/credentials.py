@@ -211,13 +211,13 @@ def load_certificates(path: Path) -> list[Certificate]:
         certificates = load_pem_x509_certificates(content)
     except (ValueError, InvalidVersion):
         raise Credential(path, "the file contains no certificate in PEM form") from None
-    now = datetime.now(UTC)
+    now_utc = datetime.now(UTC)
     for certificate in certificates:
         first, last = certificate.not_valid_before_utc, certificate.not_valid_after_utc
-        if not first <= now <= last:
+        if not first <= now_utc <= last:
             why = (
                 f"the certificate is not valid before {first:{MINUTE}}"
-                if now < first
+                if now_utc < first
                 else f"the certificate expired on {last:{MINUTE}}"
             )
             raise Credential(path, f"{why} UTC")

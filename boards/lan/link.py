@@ -140,14 +140,14 @@ class LanLink:
         channel = declare(key, zenoh.handlers.RingChannel(unread), **options)
         self._kept.append(channel)
 
-        def waiting() -> Iterator[Any]:
+        def take_samples() -> Iterator[Any]:
             # Take at most one buffer's worth, so that a flood cannot prolong the cycle.
             for _ in range(unread):
                 if (sample := channel.try_recv()) is None:
                     return
                 yield sample
 
-        return waiting
+        return take_samples
 
     def subscribe(self, key: str) -> Callable[[], Iterator[Arrived]]:
         """Return a function that yields the new messages under a key expression, oldest first."""
@@ -157,11 +157,11 @@ class LanLink:
     def on(self, key: str, callback: Callable[[Arrived], None]) -> None:
         """Call a function for each message under a key expression, in a thread of zenoh."""
 
-        def take(sample: zenoh.Sample) -> None:
+        def pass_sample(sample: zenoh.Sample) -> None:
             callback(Arrived.of(sample))
 
         # Indirect callbacks would add the wake-up of another thread and an unbounded queue.
-        handler = zenoh.handlers.Callback(take, indirect=False)
+        handler = zenoh.handlers.Callback(pass_sample, indirect=False)
         self._kept.append(self.session.declare_subscriber(key, handler))
 
     def answer(self, key: str, unread: int = UNREAD) -> Callable[[], Iterator[Question]]:
@@ -171,15 +171,15 @@ class LanLink:
         """
         waiting = self._channel(self.session.declare_queryable, key, unread)
 
-        def questions() -> Iterator[Question]:
+        def take_questions() -> Iterator[Question]:
             for query in waiting():
                 with query:
                     content = _bytes_of(query.payload) or b""
-                    asked = Arrived(str(query.key_expr), _bytes_of(query.attachment), content)
-                    if "*" not in asked.key:
-                        yield Question(asked, _reply(query))
+                    question = Arrived(str(query.key_expr), _bytes_of(query.attachment), content)
+                    if "*" not in question.key:
+                        yield Question(question, _reply(query))
 
-        return questions
+        return take_questions
 
     def declare_alive(self, launch: int, cycle_ns: int = 0) -> None:
         """Declare the liveliness token of this launch.
@@ -199,13 +199,13 @@ class LanLink:
         declare = self.session.liveliness().declare_subscriber
         waiting = self._channel(declare, ALL_ALIVE, TOKENS, history=True)
 
-        def changes() -> Iterator[tuple[str, int, bool]]:
+        def take_changes() -> Iterator[tuple[str, int, bool]]:
             for sample in waiting():
                 key = str(sample.key_expr)
                 if (parsed := launch_and_cycle(key)) is not None:
                     yield key.split("/")[1], parsed[0], sample.kind == zenoh.SampleKind.PUT
 
-        return changes
+        return take_changes
 
     def close(self) -> None:
         """Close the session. Other racks notice it at once."""

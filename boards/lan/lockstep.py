@@ -84,10 +84,10 @@ def unpack_step(head: Envelope, content: bytes) -> Step | None:
     if head.kind != STEP_KIND:
         return None
     try:
-        cycle_ns, racks, parts = z_deserialize(_CONTENT, zenoh.ZBytes(content))
+        cycle_ns, racks, export_tuples = z_deserialize(_CONTENT, zenoh.ZBytes(content))
     except ZDeserializeError:
         return None
-    exports = [Arrived(*part) for part in parts]
+    exports = [Arrived(*export) for export in export_tuples]
     # The deserialiser ignores trailing bytes, so compare with what the step packs to.
     if pack_step(cycle_ns, racks, exports) != content:
         return None
@@ -265,7 +265,7 @@ class Barrier:
             self._send_again(StepFlag.FIRST)
         else:
             self._send(*self._steps[-1], StepFlag(0))
-        while late := [
+        while late_partners := [
             partner for partner in self._partners.values() if not partner.has_reached(now_ns)
         ]:
             try:
@@ -274,7 +274,7 @@ class Barrier:
                 if self._is_over:
                     return False
                 # Show which rack is awaited, and give it up if its adapter is gone for too long.
-                awaited = late[0]
+                awaited = late_partners[0]
                 self._block[Block.AWAITS] = awaited.word
                 awaited.is_out |= awaited.is_gone_for(GIVE_UP_S)
         self._block[Block.AWAITS] = 0

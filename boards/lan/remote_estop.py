@@ -65,10 +65,10 @@ class Desk:
 
     def answer(self, tick: int) -> None:
         """Answer the requests that have arrived, and latch the emergency stop if one demands it."""
-        for asked, reply in self._requests():
-            head = self._sealer.opened(*asked)
-            asker = asked.key.split("/")[1]
-            if isinstance(head, Flaw) or head.kind != ESTOP_KIND or asked.payload:
+        for request, reply in self._requests():
+            head = self._sealer.opened(*request)
+            asker = request.key.split("/")[1]
+            if isinstance(head, Flaw) or head.kind != ESTOP_KIND or request.payload:
                 self.count.dropped += 1
                 continue
             if asker not in self._askers:

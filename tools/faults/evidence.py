@@ -168,20 +168,20 @@ def aftermath(
     """
     if strike.tick < 0:
         return Aftermath()
-    after = [event for event in events if event.tick >= strike.tick]
-    collisions = {event.tick for event in after if event.code == COLLISION}
+    events_after = [event for event in events if event.tick >= strike.tick]
+    collisions = {event.tick for event in events_after if event.code == COLLISION}
     reactions = [
         event
-        for event in after
+        for event in events_after
         if event.kind == "reaction"
         and event.tick < horizon
         and not (event.code == BRAKES and event.tick in collisions)
         and _can_react(strike, event)
     ]
-    undone_ticks = [_undone(reaction, after) for reaction in reactions]
+    undone_ticks = [_undone(reaction, events_after) for reaction in reactions]
     flows = {
         event.subject: event.tick
-        for event in reversed(after)
+        for event in reversed(events_after)
         if event.code == "flows" and event.tick >= strike.ends
     }
     undone_ticks += [flows.get(mailbox) for mailbox in owed]
@@ -216,16 +216,16 @@ def takes_cycles(strike: Strike) -> bool:
 
 def _are_engaged(tick: int, events: Sequence[Event]) -> bool:
     """Return True if the brakes were closed before a tick and opened only after it."""
-    before = [e for e in events if e.kind == "reaction" and e.code == BRAKES and e.tick < tick]
-    undone = (_undone(event, events) for event in before)
+    brakings = [e for e in events if e.kind == "reaction" and e.code == BRAKES and e.tick < tick]
+    undone = (_undone(event, events) for event in brakings)
     return any(released is None or released > tick for released in undone)
 
 
-def _undone(reaction: Event, after: Sequence[Event]) -> int | None:
+def _undone(reaction: Event, events_after: Sequence[Event]) -> int | None:
     """Return the tick at which a reaction was undone, or None."""
     recoveries = (
         event.tick
-        for event in after
+        for event in events_after
         if event.kind == "recovery"
         and event.code == UNDONE_BY.get(reaction.code)
         and event.tick >= reaction.tick

@@ -164,9 +164,9 @@ class Judge:
         used: set[int] = set()
         judged = []
         windows = [self._window(strike) for strike in self._strikes]
-        for place, strike in enumerate(self._strikes):
-            last = windows[place][1]
-            later = self._strikes[place + 1 :]
+        for index, strike in enumerate(self._strikes):
+            last = windows[index][1]
+            later = self._strikes[index + 1 :]
             detections = self._detections(strike, last, used)
             own_detections = [
                 detection for detection in detections if not self._is_of_any(detection, later)
@@ -221,15 +221,15 @@ class Judge:
         read = last_read(strike.mailboxes, self._layout)
         return over + self._recovery(strike) + read + self._settle
 
-    def _detections(self, strike: Strike, until: int, used: set[int]) -> list[Detection]:
-        """Return the unused events up to tick `until` that may be the detection of a fault."""
+    def _detections(self, strike: Strike, last_tick: int, used: set[int]) -> list[Detection]:
+        """Return the unused events up to `last_tick` that may be the detection of a fault."""
         if not strike.count:
             # It need not be detected, so any later detection belongs to something else.
-            until = min(until, strike.ends)
+            last_tick = min(last_tick, strike.ends)
         fitting = (
             event
             for event in self._events
-            if event.tick <= until and fits(event, strike) and id(event) not in used
+            if event.tick <= last_tick and fits(event, strike) and id(event) not in used
         )
         return [self._detection(event, strike) for event in fitting]
 
@@ -245,10 +245,10 @@ class Judge:
             and not mailbox_spec.max_age
         )
 
-    def _is_of_any(self, late: Detection, later: Sequence[Strike]) -> bool:
+    def _is_of_any(self, detection: Detection, later: Sequence[Strike]) -> bool:
         """Return True if a detection that is too late for one fault is in time for a later one."""
-        return not late.is_within and any(
-            fits(late.event, strike) and self._detection(late.event, strike).is_within
+        return not detection.is_within and any(
+            fits(detection.event, strike) and self._detection(detection.event, strike).is_within
             for strike in later
         )
 
@@ -256,8 +256,8 @@ class Judge:
         """Return True if a fault of the arm ended before it had to be detected."""
         if strike.record.where != "arm":
             return False
-        until = strike.hidden + strike.count * cycle_ticks(self._layout, strike.board)
-        return not strike.count or until < (self._bound(strike) or 0)
+        active_ticks = strike.hidden + strike.count * cycle_ticks(self._layout, strike.board)
+        return not strike.count or active_ticks < (self._bound(strike) or 0)
 
     def _detection(self, event: Event, strike: Strike) -> Detection:
         """Return an event as the detection of a fault, with its delay and its bound."""
@@ -282,7 +282,7 @@ class Judge:
         """Judge a fault by its best detection and by the reactions up to `horizon`."""
         visible_from = strike.record.visible_from
         owed = tuple(filter(self._is_periodic, strike.affected)) or strike.affected
-        after = aftermath(strike, self._events, horizon, owed)
+        aftermath_found = aftermath(strike, self._events, horizon, owed)
         found_tick = best.event.tick if best else strike.tick
         # Ticks from the first action within which every reaction must be undone.
         ends = max(min(end_of(strike), self._last), found_tick)
@@ -291,8 +291,8 @@ class Judge:
             # The writer has no period, so its next message may come at any time in the run.
             recovery_bound = self._last + 1 - strike.tick
         # Only kinds that may end the task with an error have this reaction.
-        is_latched = self._run.has_failed and LATCHED in after.reactions
-        is_undone = after.is_undone and (after.recovery or 0) <= recovery_bound
+        is_latched = self._run.has_failed and LATCHED in aftermath_found.reactions
+        is_undone = aftermath_found.is_undone and (aftermath_found.recovery or 0) <= recovery_bound
         return Judgement(
             kind=strike.kind,
             board=strike.board,
@@ -303,11 +303,11 @@ class Judge:
             struck=strike.tick,
             is_judged=visible_from is None or (strike.size or 0.0) >= visible_from,
             cycle=cycle_ticks(self._layout, strike.board),
-            reactions=after.reactions,
+            reactions=aftermath_found.reactions,
             is_recovered=is_latched or is_undone,
-            recovery=after.recovery,
+            recovery=aftermath_found.recovery,
             recovery_bound=recovery_bound,
-            lacking=after.lacking,
+            lacking=aftermath_found.lacking,
             is_latched=is_latched,
             **self._seen(strike, best),
         )
@@ -315,8 +315,8 @@ class Judge:
     def _seen(self, strike: Strike, best: Detection | None) -> Report:
         """Return the fields of a judgement that describe the detection."""
         if best is None:
-            seen = "not struck" if strike.tick < 0 else "missed"
-            return {"seen": seen, "bound": self._bound(strike)}
+            seen_text = "not struck" if strike.tick < 0 else "missed"
+            return {"seen": seen_text, "bound": self._bound(strike)}
         return {
             "seen": "detected",
             "found_by": "the Rack" if best.event.kind == DIED else best.event.board,
@@ -334,9 +334,12 @@ class Judge:
             return False
         # An event of a task has the tick of its release, but its cause may act until the end of
         # the cycle.
-        until = event.tick + self._cycles.get(event.board, 1) - 1
+        last_tick = event.tick + self._cycles.get(event.board, 1) - 1
         return not any(
-            strike.tick >= 0 and first <= until and event.tick <= last and explains(strike, event)
+            strike.tick >= 0
+            and first <= last_tick
+            and event.tick <= last
+            and explains(strike, event)
             for strike, (first, last) in zip(self._strikes, windows, strict=True)
         )
 

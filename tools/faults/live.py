@@ -125,15 +125,17 @@ class LiveRack:
         rows = [[_cell(fault[key]) for key in columns.values()] for fault in self.faults()]
         return fitted(list(columns), rows)
 
-    def _fault(self, given: Document) -> FaultConfig:
+    def _fault(self, settings: Document) -> FaultConfig:
         """Validate the keys of a fault. Raises `ConfigError`."""
         # Two faults of one run must not draw the same random numbers.
-        given.setdefault("seed", (self._config.seed + self._segment.words[System.INJECTED]) % SEEDS)
+        settings.setdefault(
+            "seed", (self._config.seed + self._segment.words[System.INJECTED]) % SEEDS
+        )
         try:
             # Values from a command line are texts, so let numbers be converted from text.
-            return FaultConfig.model_validate(given, strict=False)
+            return FaultConfig.model_validate(settings, strict=False)
         except ValidationError as error:
-            raise ConfigError(mistakes_of(error, FaultConfig, given)) from None
+            raise ConfigError(mistakes_of(error, FaultConfig, settings)) from None
 
     def _check(self, fault: FaultConfig) -> None:
         """Check that a running rack, and this process, can have a fault.
@@ -201,8 +203,8 @@ class LiveRack:
         if entry.stage == Stage.WAITING:
             how = f"to withdraw it: rack inject {self._segment.rack} --withdraw {entry.index}"
             awaited = self._awaited(entry)
-            held = waits(self._segment) if awaited == NEXT_TICK else ""
-            return f"{fault}: armed, {held or f'waits for {awaited}'}; {how}"
+            hold_text = waits(self._segment) if awaited == NEXT_TICK else ""
+            return f"{fault}: armed, {hold_text or f'waits for {awaited}'}; {how}"
         if entry.stage == Stage.OVER:
             acted = "once" if entry.count == 1 else f"{entry.count} times"
             return f"{fault}: ticks {first} to {last}, acted {acted}"
@@ -214,8 +216,8 @@ class LiveRack:
         if entry.when_box < 0:
             if entry.tick <= 0:
                 return NEXT_TICK
-            now = self._segment.words[System.TICK]
-            return f"tick {entry.tick}; the rack is at tick {now}"
+            tick = self._segment.words[System.TICK]
+            return f"tick {entry.tick}; the rack is at tick {tick}"
         when = (entry.when_box, entry.when_field, entry.when_value)
         return condition_text(when, self._segment.layout)
 

@@ -120,7 +120,7 @@ class EstopSession:
             Failure: The rack has ended, does not permit the stop, or does not answer.
         """
         rack = self._address.rack
-        at = f"rack '{rack}' at {self._address.at}"
+        rack_text = f"rack '{rack}' at {self._address.at}"
         first_s = time.monotonic()
         # Whether the rack has accepted a request, which its adapter answers in its next cycle.
         was_taken = False
@@ -132,7 +132,7 @@ class EstopSession:
             was_taken |= now_s - began_s > ANSWER_S / 2
             self._await(lambda: True, 0.0)
             if self._launches.get(rack) != launch:
-                raise Failure(f"{at} has ended, or is out of reach")
+                raise Failure(f"{rack_text} has ended, or is out of reach")
             if not was_taken and now_s - first_s > DENIED_S:
                 raise Failure(
                     f"rack '{rack}' does not permit '{self._operator.name}' to stop it;"
@@ -140,7 +140,7 @@ class EstopSession:
                 )
             if now_s - first_s > PATIENCE_S:
                 why = "its adapter does not cycle; does `rack step` hold it?"
-                raise Failure(f"{at} has not answered for {PATIENCE_S:g} s: {why}")
+                raise Failure(f"{rack_text} has not answered for {PATIENCE_S:g} s: {why}")
             time.sleep(PAUSE_S)
 
     def _request(self, launch: int, flags: int) -> int | None:
@@ -225,19 +225,23 @@ def check_reach(rack: RackAddress, operator: Operator) -> None:
     Raises:
         Failure: Nothing listens there, or the operator has no usable certificate but needs one.
     """
-    at = rack.at
+    host_text = rack.at
     try:
         with socket.create_connection((rack.host.strip("[]"), rack.port), CONNECT_S) as connection:
             address = ipaddress.ip_address(connection.getpeername()[0].partition("%")[0])
     except TimeoutError:
-        raise Failure(f"{at}: no answer at port {rack.port} within {CONNECT_S:g} s") from None
+        raise Failure(
+            f"{host_text}: no answer at port {rack.port} within {CONNECT_S:g} s"
+        ) from None
     except OSError as error:
-        raise Failure(f"{at}: cannot connect to port {rack.port}: {error.strerror}") from None
+        raise Failure(
+            f"{host_text}: cannot connect to port {rack.port}: {error.strerror}"
+        ) from None
     if operator.certificates:
         credentials = Credentials(Path(operator.certificates), operator.name)
         if (flaw := next(credentials.flaws(), None)) is not None:
             raise Failure(str(flaw))
     elif not address.is_loopback:
         raise Failure(
-            f"{at} is another machine, so a stop needs certificates; see --certificates", 2
+            f"{host_text} is another machine, so a stop needs certificates; see --certificates", 2
         )

@@ -62,17 +62,17 @@ def certificates(
             "certificates are made with 'cryptography', which is missing: install nasrem-rack[lan]"
         ) from None
     by_name = named_addresses(names)
-    made = make_credentials(folder, by_name, days)
+    credentials = make_credentials(folder, by_name, days)
     answer = {
         "folder": str(folder),
-        "made": list(made.files),
+        "made": list(credentials.files),
         "names": by_name,
-        "expires": made.expires.isoformat(timespec="seconds"),
+        "expires": credentials.expires.isoformat(timespec="seconds"),
     }
     first = next(iter(by_name))
     lines = [
-        f"made in {folder}: {', '.join(made.files)}",
-        f"valid until {made.expires:%Y-%m-%d}",
+        f"made in {folder}: {', '.join(credentials.files)}",
+        f"valid until {credentials.expires:%Y-%m-%d}",
         "This set is for tests: whoever has the folder can act as any of these racks.",
         f"Each machine needs only authority.pem and one pair: {first}.pem and {first}-key.pem.",
     ]

@@ -162,13 +162,13 @@ class Agreement:
         """
         answers = [reading.message for reading in self._answers.values()]
         own_answers = [answer for answer in answers if answer.program == self.program]
-        ended = [answer for answer in own_answers if answer.response == Response.ENDED]
-        newest = max([answer.echo for answer in ended or own_answers], default=0)
+        ended_reports = [answer for answer in own_answers if answer.response == Response.ENDED]
+        newest = max([answer.echo for answer in ended_reports or own_answers], default=0)
         if newest // ATTEMPTS in range(1, len(self._steps) + 2):
             self.step = newest // ATTEMPTS - 1
             self.attempt = newest % ATTEMPTS
-        if ended:
-            self.end(Error(ended[0].error), ended[0].reason)
+        if ended_reports:
+            self.end(Error(ended_reports[0].error), ended_reports[0].reason)
         elif self._are_there(self._arms):
             self.begun = self._now_s
             self._go_on()

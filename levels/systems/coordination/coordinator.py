@@ -102,16 +102,16 @@ class CellProgram(Program):
             if not step.do:
                 yield f"step[{k}].do", [], "a step must have at least one action"
             for n, action in enumerate(step.do):
-                place = f"step[{k}].do[{n}]"
+                key = f"step[{k}].do[{n}]"
                 if action.arm in arms:
                     yield (
-                        f"{place}.arm",
+                        f"{key}.arm",
                         action.arm,
                         "this arm already has an action in this step",
                     )
                 if action.by is not None and action.by <= latest:
                     yield (
-                        f"{place}.by",
+                        f"{key}.by",
                         action.by,
                         f"must be later than {latest:g}, the time of an earlier step",
                     )
@@ -120,13 +120,13 @@ class CellProgram(Program):
                     action.object.isascii() and len(action.object) <= OBJECT_BYTES
                 ):
                     yield (
-                        f"{place}.object",
+                        f"{key}.object",
                         action.object,
                         f"an order can contain at most {OBJECT_BYTES} ASCII characters",
                     )
                 if isinstance(action, ArmGoto) and len(action.joints or ()) > MAX_JOINTS:
                     yield (
-                        f"{place}.joints",
+                        f"{key}.joints",
                         list(action.joints or ()),
                         f"an order can contain at most {MAX_JOINTS} joints",
                     )
@@ -202,12 +202,12 @@ class Coordinator(Executor):
             above: Contexts of the levels above. Not used.
             below: Contexts of the levels below. Not used.
         """
-        known = read_params(CoordinatorParams, context.params).arms
+        known_arms = read_params(CoordinatorParams, context.params).arms
         for k, step in enumerate(CellProgram.model_validate(context.task).step):
             for n, action in enumerate(step.do):
-                if action.arm not in known:
+                if action.arm not in known_arms:
                     why = f"lacks '{action.arm}', the arm of task.step[{k}].do[{n}]"
-                    yield "params.arms", ", ".join(known), why
+                    yield "params.arms", ", ".join(known_arms), why
 
     def process(self, tick: int) -> None:
         """Read the reports of the arms, advance the program, and write the orders."""
@@ -241,8 +241,10 @@ class Coordinator(Executor):
         agreement = self._agreement
         reports = [self._readings[arm].message for arm in agreement.partners]
         present = agreement.program, agreement.order
-        own = [report for report in reports if (report.program, report.echo) == present]
-        return sum(report.moves_done for report in own), sum(report.moves for report in own)
+        own_reports = [report for report in reports if (report.program, report.echo) == present]
+        return sum(report.moves_done for report in own_reports), sum(
+            report.moves for report in own_reports
+        )
 
     def _reason_to_hold(self) -> str:
         """Return why the arms must rest on their paths, or an empty string."""

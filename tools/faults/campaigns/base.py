@@ -44,10 +44,10 @@ class Start:
         """Return the start at the snapshot that was used, with the events before its tick."""
         if self.continues is None:
             return self
-        before = (
+        earlier_events = (
             event for event in self.events if event.tick < tick and event.kind not in OF_LAUNCH
         )
-        return Start(tick, "", self.continues, tuple(before))
+        return Start(tick, "", self.continues, tuple(earlier_events))
 
 
 class BaseRack:
@@ -81,8 +81,8 @@ class BaseRack:
             self._run(crate, seconds)
         if self._why_none:
             return Start(whole=f"{UNKEPT}{self._why_none}")
-        known = Continuation(plan.first, len(self._config.fault), len(self._config.command))
-        return Start(continues=known, events=tuple(self._events))
+        continuation = Continuation(plan.first, len(self._config.fault), len(self._config.command))
+        return Start(continues=continuation, events=tuple(self._events))
 
     def _run(self, crate: WarmCrate, seconds: float | None) -> None:
         """Run the faultless rack in a crate, which keeps its snapshots."""

@@ -225,37 +225,37 @@ class Campaign:
         if result.shortfalls and plan.number:
             path = self.folder / f"trial-{plan.number:04}.toml"
             path.write_text(plan.toml(self.order.name))
-        ended = f"{_text(plan)}: {result.ended}"
-        self._progress.end(self._guess_s([plan]), ended, result.shortfalls)
+        text = f"{_text(plan)}: {result.ended}"
+        self._progress.end(self._guess_s([plan]), text, result.shortfalls)
 
     def _run_faultless(self, results: Results) -> None:
         """Run without faults for as long as ordered, without load and under load."""
         if not self.order.faultless_s:
             return
-        for place, is_loaded in enumerate(self.order.loads):
+        for stretch, is_loaded in enumerate(self.order.loads):
             if INTERRUPT.number:
                 return
             burden = load() if is_loaded else nullcontext("")
-            with burden as under:
-                runs = tuple(self._calm(place, under))
+            with burden as load_text:
+                runs = tuple(self._calm(stretch, load_text))
             seconds = sum(run.ticks for run in runs) / self._second
-            results.faultless.append(Faultless(under, seconds, runs))
+            results.faultless.append(Faultless(load_text, seconds, runs))
 
-    def _calm(self, place: int, under: str) -> Iterator[TrialResult]:
+    def _calm(self, stretch: int, load_text: str) -> Iterator[TrialResult]:
         """Yield the results of faultless runs in real time.
 
         Args:
-            place: Index of the stretch of faultless time.
-            under: Description of the load. Empty without load.
+            stretch: Index of the stretch of faultless time.
+            load_text: Description of the load. Empty without load.
         """
         faultless = self._job(Plan(0, "faultless", lockstep=False))
-        name = f"faultless under {under}" if under else "faultless"
+        name = f"faultless under {load_text}" if load_text else "faultless"
         left_s = self.order.faultless_s
         run_number = 0
         while left_s >= SHORTEST_S and not INTERRUPT.number:
             self._progress.begin(f"{name}, {left_s:.0f} s left")
             seconds = left_s if left_s < self._ticks / self._second else self.order.seconds
-            path = faultless.path.with_stem(f"faultless-{place}-{run_number:03}")
+            path = faultless.path.with_stem(f"faultless-{stretch}-{run_number:03}")
             job = replace(faultless, path=path, seconds=seconds)
             if _kept(job) is None:
                 list(self._workers.run([job], alone=True))

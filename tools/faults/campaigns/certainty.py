@@ -66,15 +66,15 @@ def certain_from(
         A tick up to `tick` if the judgement is certain, a later tick at which to ask again, or None
         if the judgement needs the whole run.
     """
-    now = Event(0, tick, "end", "", "")
-    return _ForesightedJudge(strikes, [*events, now], run).certain_from(tick)
+    end_event = Event(0, tick, "end", "", "")
+    return _ForesightedJudge(strikes, [*events, end_event], run).certain_from(tick)
 
 
 class _ForesightedJudge(Judge):
     """Judge that also computes when its judgements become final."""
 
     def certain_from(self, tick: int) -> int | None:
-        """Return the tick from which all judgements are final: see the function `certain_from`."""
+        """Return the tick from which all judgements are final: see the function of this name."""
         latest = tick
         for strike, judgement in zip(self._strikes, self.verdict().faults, strict=True):
             certain_tick = self._closes(strike, judgement, tick)
@@ -84,7 +84,7 @@ class _ForesightedJudge(Judge):
         return latest
 
     def _closes(self, strike: Strike, judgement: Judgement, tick: int) -> int | None:
-        """Return the tick from which the judgement of one fault is final: see `certain_from`."""
+        """Return the tick from which one judgement is final: see `find_certain_tick`."""
         retry_tick = tick + self._settle
         if strike.began < 0:
             return retry_tick

@@ -309,8 +309,8 @@ def _packed(
     shared = [card for card in cards if card.target.record.recoverable]
     trials = [
         share.cards
-        for at in range(0, len(shared), BATCH)
-        for share in _shared_out(rack.room, shared[at : at + BATCH])
+        for first_card in range(0, len(shared), BATCH)
+        for share in _shared_out(rack.room, shared[first_card : first_card + BATCH])
     ]
     trials += [[card] for card in cards if not card.target.record.recoverable]
     plans = list[Plan]()
@@ -328,19 +328,19 @@ def _packed(
     return plans
 
 
-def _shared_out(room: int, cards: Sequence[Card]) -> list[Share]:
+def _shared_out(room_ticks: int, cards: Sequence[Card]) -> list[Share]:
     """Distribute faults over trials: the longest first, each where least room is left."""
     shares: list[Share] = []
     for card in sorted(cards, key=lambda card: -card.window):
         fitting = [share for share in shares if share.takes(card)]
         if not fitting:
-            fitting = [Share(room)]
+            fitting = [Share(room_ticks)]
             shares += fitting
         min(fitting, key=lambda share: share.room).add(card)
     return shares
 
 
-def _ordered(room: int, cards: Sequence[Card], rng: Random) -> list[Card]:
+def _ordered(room_ticks: int, cards: Sequence[Card], rng: Random) -> list[Card]:
     """Return faults in the best of some random orders.
 
     If possible, each begins before the end of a task that earlier faults have prolonged. Faults of
@@ -350,8 +350,8 @@ def _ordered(room: int, cards: Sequence[Card], rng: Random) -> list[Card]:
 
     def rate_order(order: list[Card]) -> tuple[bool, int]:
         needed = max(accumulate(card.room for card in order))
-        before = takewhile(lambda card: card.target.record.where != "arm", order)
-        return needed <= room, sum(card.window for card in before)
+        cards_before = takewhile(lambda card: card.target.record.where != "arm", order)
+        return needed <= room_ticks, sum(card.window for card in cards_before)
 
     return max(orders, key=rate_order)
 

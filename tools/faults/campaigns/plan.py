@@ -201,18 +201,20 @@ def kinds_for(wanted: str | None, targets: Targets, realtime: bool) -> list[str]
     Raises:
         Failure: A kind is unknown, or the rack cannot have it.
     """
-    known = {kind.name: kind.realtime for kind in KINDS} | {EXTERNAL: False}
+    needs_real_time_by_kind = {kind.name: kind.realtime for kind in KINDS} | {EXTERNAL: False}
     possible = [
-        name for name, needs in known.items() if (realtime or not needs) and targets.by_kind[name]
+        name
+        for name, needs in needs_real_time_by_kind.items()
+        if (realtime or not needs) and targets.by_kind[name]
     ]
     if wanted is None:
         return possible
     named = dict.fromkeys(name.strip() for name in wanted.split(",") if name.strip())
     valid_text = f"valid kinds: {', '.join(possible)}"
     for name in named:
-        if name not in known:
+        if name not in needs_real_time_by_kind:
             raise Failure(f"--kinds {name}: there is no such kind; {valid_text}", 2)
-        if known[name] and not realtime:
+        if needs_real_time_by_kind[name] and not realtime:
             why = f"{name} needs real time, and the campaign is in lockstep"
             raise Failure(f"--kinds {name}: {why}; {valid_text}", 2)
         if name not in possible:

@@ -32,8 +32,8 @@ def plot(report: CampaignReport, path: Path) -> None:
     """Draw a campaign into a PNG file: delays against bounds, curves of size, recovery times."""
     order = report.order
     with picture([path], *SIZE_IN) as figure:
-        for place, draw in zip(_places(figure), (_delays, _sizes, _recoveries), strict=True):
-            draw(figure.add_subplot(place), report)
+        for position, draw in zip(_places(figure), (_delays, _sizes, _recoveries), strict=True):
+            draw(figure.add_subplot(position), report)
         title = f"Faults injected into {order.name}: {report.trials}, seed {order.seed}"
         figure.suptitle(title, fontsize=11)
 
@@ -62,11 +62,13 @@ def _delays(axes: Axes, report: CampaignReport) -> None:
     """
     kinds = list(report.by_kind)[::-1]
     for row, kind in enumerate(kinds):
-        found = [fault for fault in report.faults_of(kind) if fault.seen == "detected"]
-        fractions = [part for part in map(_part, found) if part is not None]
-        _row(axes, row, [part for part in fractions if part <= WIDEST])
-        late = sum(part > WIDEST for part in fractions)
-        axes.scatter([WIDEST] * late, [row] * late, marker=">", s=40, color=BOUND, clip_on=False)
+        detected = [fault for fault in report.faults_of(kind) if fault.seen == "detected"]
+        fractions = [fraction for fraction in map(_part, detected) if fraction is not None]
+        _row(axes, row, [fraction for fraction in fractions if fraction <= WIDEST])
+        late_count = sum(fraction > WIDEST for fraction in fractions)
+        axes.scatter(
+            [WIDEST] * late_count, [row] * late_count, marker=">", s=40, color=BOUND, clip_on=False
+        )
         if fractions:
             axes.scatter([min(WIDEST, median(fractions))], [row], marker="|", s=180, color=MIDDLE)
         figures = report.by_kind[kind]
@@ -109,15 +111,15 @@ def _sizes(axes: Axes, report: CampaignReport) -> None:
     """Draw the size of sensor errors against the delay of their detection."""
     edge = axes.get_xaxis_transform()
     longest = 10 * report.clock_ms
-    for (kind, found), marker in zip(report.curves.items(), "os", strict=False):
-        sizes = [point.size for point in found.curve if point.delay_ms is not None]
-        delays = [point.delay_ms for point in found.curve if point.delay_ms is not None]
-        unseen = [point.size for point in found.curve if point.delay_ms is None]
+    for (kind, size_curve), marker in zip(report.curves.items(), "os", strict=False):
+        sizes = [point.size for point in size_curve.curve if point.delay_ms is not None]
+        delays = [point.delay_ms for point in size_curve.curve if point.delay_ms is not None]
+        unseen = [point.size for point in size_curve.curve if point.delay_ms is None]
         longest = max([longest, *delays])
         (line,) = axes.plot(sizes, delays, marker, markersize=5, alpha=0.6, label=kind)
         color = line.get_color()
         axes.plot(unseen, [1.0] * len(unseen), "x", color=color, transform=edge, clip_on=False)
-        axes.axvline(found.judged_from, color=color, linewidth=0.9, linestyle=":")
+        axes.axvline(size_curve.judged_from, color=color, linewidth=0.9, linestyle=":")
     if report.curves:
         axes.set_xscale("log")
         axes.xaxis.set_minor_formatter(NullFormatter())

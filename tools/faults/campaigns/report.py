@@ -156,8 +156,8 @@ class CampaignReport:
                 kind: {**asdict(figures), **self._trials_with(kind)}
                 for kind, figures in self.by_kind.items()
             },
-            "sizes": {kind: asdict(found) for kind, found in self.curves.items()},
-            "faultless": [part.document() for part in self.results.faultless],
+            "sizes": {kind: asdict(size_curve) for kind, size_curve in self.curves.items()},
+            "faultless": [stretch.document() for stretch in self.results.faultless],
             "faults": [
                 {"trial": run.plan.number, "lockstep": run.plan.lockstep, **asdict(fault)}
                 for run in self.results.trials
@@ -175,12 +175,12 @@ class CampaignReport:
 
     def _trials_with(self, kind: str) -> dict[str, int]:
         """Count the trials in which a kind acted, and how many of them completed their task."""
-        ended = [
+        ends = [
             run.ended
             for run in self.results.trials
             if any(fault.kind == kind and fault.struck >= 0 for fault in run.faults)
         ]
-        return {"trials": len(ended), "tasks_done": ended.count("task done")}
+        return {"trials": len(ends), "tasks_done": ends.count("task done")}
 
     def markdown(self) -> str:
         """Return the content of campaign.md."""
@@ -210,8 +210,8 @@ class CampaignReport:
                 " detected, in bound and recovered."
             )
         yield from self._faultless()
-        for kind, found in self.curves.items():
-            yield from _sizes(kind, found)
+        for kind, size_curve in self.curves.items():
+            yield from _sizes(kind, size_curve)
         if self.shortfalls:
             yield from ("", f"## Shortfalls: {len(self.shortfalls)}", "")
             yield from (f"- {line}" for line in self.shortfalls[:SHOWN])
@@ -228,8 +228,8 @@ class CampaignReport:
         if summary.latched:
             recovered += f", including {summary.latched} that ended the task, as permitted"
         yield "recovered from", recovered
-        ended = self.results.ended
-        ends = [f"{ended[name]} {name}" for name in get_args(Ended) if ended[name]]
+        end_counts = self.results.ended
+        ends = [f"{end_counts[name]} {name}" for name in get_args(Ended) if end_counts[name]]
         yield "trials ended", ", ".join(ends) or "none"
         continued = [run for run in self.results.trials if run.start]
         skipped_s = sum(run.start for run in continued) * self.clock_ms * 1e-3
@@ -249,10 +249,10 @@ class CampaignReport:
     def _faultless(self) -> Iterator[str]:
         """Yield the lines about faultless time."""
         rows = []
-        for part in self.results.faultless:
-            load = f"under {part.load}" if part.load else "alone"
-            misses = [f"{count} {name.replace('_', ' ')}" for name, count in part.misses.items()]
-            row = [load, f"{part.seconds:.0f}", str(part.trips), _rate(part.rate)]
+        for stretch in self.results.faultless:
+            load = f"under {stretch.load}" if stretch.load else "alone"
+            misses = [f"{count} {name.replace('_', ' ')}" for name, count in stretch.misses.items()]
+            row = [load, f"{stretch.seconds:.0f}", str(stretch.trips), _rate(stretch.rate)]
             rows.append([*row, ", ".join(misses) or "none"])
         if rows:
             yield from ("", "## Faultless, in real time", "")
@@ -264,19 +264,19 @@ def _summary(results: Results, second: float) -> CampaignSummary:
     """Compute the figures of all kinds together. `second` is the number of ticks in a second."""
     trials = results.trials
     runs = results.runs
-    ended = results.ended
-    faultless_s = sum(part.seconds for part in results.faultless)
-    trips = sum(part.trips for part in results.faultless)
+    end_counts = results.ended
+    faultless_s = sum(stretch.seconds for stretch in results.faultless)
+    trips = sum(stretch.trips for stretch in results.faultless)
     simulated_s = sum(run.ticks for run in runs) / second
     unexplained = sum(len(run.unexplained) for run in runs)
     return CampaignSummary(
         **vars(totals(results.faults)),
         trials=len(trials),
-        tasks_done=ended["task done"],
-        verdicts_certain=ended["verdicts certain"],
-        safely_stopped=ended["safely stopped"],
-        not_armed=ended["not armed"],
-        neither=ended["neither"],
+        tasks_done=end_counts["task done"],
+        verdicts_certain=end_counts["verdicts certain"],
+        safely_stopped=end_counts["safely stopped"],
+        not_armed=end_counts["not armed"],
+        neither=end_counts["neither"],
         limits_violated=sum(run.violations for run in runs),
         touches=sum(run.touches for run in runs),
         left_behind=sum(len(run.left) for run in runs),

@@ -183,7 +183,7 @@ class Results:
     @property
     def runs(self) -> list[TrialResult]:
         """All runs of any purpose."""
-        faultless = [run for part in self.faultless for run in part.runs]
+        faultless = [run for stretch in self.faultless for run in stretch.runs]
         return [self.nominal, *self.trials, *self.sizes, *faultless]
 
     @property
@@ -250,7 +250,7 @@ def _shortfalls(trial: Trial, verdict: FaultVerdict, ended: Ended) -> tuple[str,
     ]
     if trial.arm.violations:
         lines.append(f"limits violated at {trial.arm.violations} substeps")
-    lines += [f"left behind: {thing}" for thing in trial.left]
+    lines += [f"left behind: {leftover}" for leftover in trial.left]
     if ended == "neither":
         lines.append(f"the task is neither done nor safely stopped: {_why_not_done(trial)}")
     # A fault had to end the task if it latched, or if the reactions to it made the task too late.

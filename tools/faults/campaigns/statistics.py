@@ -175,13 +175,13 @@ def curve(faults: Iterable[Judgement], kind: str, clock_ns: int) -> list[SizePoi
 
 def spread(values: Iterable[float | None]) -> Spread | None:
     """Return median and maximum of the values that are not None, or None if all are."""
-    known = [value for value in values if value is not None]
-    return Spread(round(median(known), 3), round(max(known), 3)) if known else None
+    numbers = [value for value in values if value is not None]
+    return Spread(round(median(numbers), 3), round(max(numbers), 3)) if numbers else None
 
 
 def _figures(kind: str, faults: Sequence[Judgement], clock_ns: int) -> KindFigures:
     """Compute the figures of one kind."""
-    seen = [fault for fault in faults if fault.seen == "detected"]
+    detected = [fault for fault in faults if fault.seen == "detected"]
     counts = vars(totals(faults))
     shares = ("detected", "within_bound", "recovered")
     bounds = [fault.bound for fault in faults if fault.bound is not None]
@@ -190,13 +190,13 @@ def _figures(kind: str, faults: Sequence[Judgement], clock_ns: int) -> KindFigur
         **counts,
         wilson={share: wilson(counts[share], counts["injected"]) for share in shares},
         bound=str(record_of(kind).bound),
-        cycles=spread(fault.delay / fault.cycle for fault in seen if fault.delay is not None),
-        ticks=spread(fault.delay for fault in seen),
+        cycles=spread(fault.delay / fault.cycle for fault in detected if fault.delay is not None),
+        ticks=spread(fault.delay for fault in detected),
         bound_ticks=bound_ticks,
-        part_of_bound=spread(fault.part_of_bound for fault in seen),
-        ms=spread(fault.delay_ms for fault in seen),
+        part_of_bound=spread(fault.part_of_bound for fault in detected),
+        ms=spread(fault.delay_ms for fault in detected),
         reactions=sorted({name for fault in faults for name in fault.reactions}),
-        recovery_ms=spread(_ms(fault.recovery, clock_ns) for fault in seen),
+        recovery_ms=spread(_ms(fault.recovery, clock_ns) for fault in detected),
     )
 
 

@@ -32,7 +32,7 @@ from rack.tools.faults.judge import Circumstances
 
 MAX_LENGTH = 4
 GRACE_S = 60.0
-"""A run with faults is stopped after `MAX_LENGTH` times a faultless run's length plus `GRACE_S`."""
+"""A run is stopped after `MAX_LENGTH_FACTOR` times a faultless run's length plus `GRACE_S`."""
 NOMINAL_S = 1800.0
 """Simulated time allowed for a run whose length is unknown."""
 STILL_S = 120.0
@@ -69,8 +69,8 @@ class Killer:
             return 0.5
         if self._words[System.LOCKSTEP]:
             return LOOK_S
-        at = max(self._instant_ns() * 1e-9, self._retry_at)
-        return min(0.5, max(0.0, at - time.monotonic()))
+        kill_s = max(self._instant_ns() * 1e-9, self._retry_at)
+        return min(0.5, max(0.0, kill_s - time.monotonic()))
 
     def advance(self) -> None:
         """Kill the board whose instant has come. If it is not running, try again later."""
@@ -204,13 +204,13 @@ def run_trial(
         ConfigError: The plan does not fit the config.
     """
     start = Start(whole="as asked") if base is None else base.start_of(plan, crate, seconds)
-    before = children()
+    pids_before = children()
     started = time.monotonic()
     rack = Rack(plan.config(config, rack_name), crate=crate, continues=start.continues)
     refused = ""
     is_cut = False
     levels = ""
-    late = False
+    has_late_level = False
     arm = ArmEnd()
     strikes_seen: tuple[Strike, ...] = ()
     try:
@@ -227,18 +227,18 @@ def run_trial(
             strikes_seen = (*strikes(rack.segment, joints), *killer.done)
             arm = arm_of(rack.segment)
             levels = levels_of(rack.segment)
-            late = is_late(rack.segment)
+            has_late_level = is_late(rack.segment)
     except ConfigError:
         raise
     except (BackplaneError, BoardError) as error:
         refused = str(error)
-    again = None
+    rerun_outcome = None
     run = None
     if not refused:
         run = _circumstances(rack, plan)
     elif plan.faults:
         faultless = replace(plan, faults=())
-        again = run_trial(config, faultless, rack_name, ticks, AGAIN_S, crate=crate).outcome
+        rerun_outcome = run_trial(config, faultless, rack_name, ticks, AGAIN_S, crate=crate).outcome
     return Trial(
         plan=plan,
         run=run,
@@ -247,11 +247,11 @@ def run_trial(
         events=tuple(sorted(rack.events, key=lambda event: event.tick)),
         strikes=strikes_seen,
         arm=arm,
-        left=tuple(left_behind(rack_name, before)),
+        left=tuple(left_behind(rack_name, pids_before)),
         wall_s=time.monotonic() - started,
         levels=levels,
-        is_late=late,
-        again=again,
+        is_late=has_late_level,
+        again=rerun_outcome,
         start=start,
         is_cut=is_cut,
     )
@@ -302,13 +302,13 @@ def _watch(
         killer.advance()
         if certainty is not None:
             certainty.look()
-        now = time.monotonic()
-        if stopped and now > deadline:
+        now_s = time.monotonic()
+        if stopped and now_s > deadline:
             return
         if not stopped and words[System.TICK] != last_tick:
             last_tick = words[System.TICK]
-            deadline = now + STILL_S
-        if not stopped and (now > deadline or last_tick > max_ticks):
+            deadline = now_s + STILL_S
+        if not stopped and (now_s > deadline or last_tick > max_ticks):
             rack.stop("the trial takes too long")
             stopped = True
-            deadline = now + STUCK_S
+            deadline = now_s + STUCK_S
