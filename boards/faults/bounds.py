@@ -152,6 +152,7 @@ class Bound:
 
     def __add__(self, other: Bound) -> Bound:
         def add_terms(case: BoundCase) -> int | None:
+            """Add the ticks of both bounds, if both have any."""
             terms = self.ticks(case), other.ticks(case)
             return None if None in terms else sum(term for term in terms if term is not None)
 
@@ -171,6 +172,7 @@ def cycles(count: int) -> Bound:
     """
 
     def count_ticks(case: BoundCase) -> int | None:
+        """Count the ticks of these cycles."""
         return None if case.role == "host" else count * case.cycle
 
     text = counting(count, "cycle") if count else "the same cycle"
@@ -184,6 +186,7 @@ def cycles_and_time(count: int, time_ns: int) -> Bound:
     """
 
     def count_ticks(case: BoundCase) -> int:
+        """Count the ticks of these cycles, at least of this time."""
         return max(count * case.cycle, ceil(time_ns / case.layout.clock_ns))
 
     return Bound(f"{counting(count, 'cycle')}, at least {time_ns * 1e-6:g} ms", count_ticks)

@@ -64,7 +64,8 @@ def _kill(stage: FaultStage, entry: FaultEntry, tick: int) -> None:
     """Kill a task's process, or the clock itself. Wait until the crate has recorded the loss."""
     task = stage.target(entry)
     if task is None:
-        # The clock kills itself. Mark the entry first, so that the restarted clock does not.
+        # The clock kills itself. Mark the entry first, so that the restarted clock does not do it
+        # again.
         entry.acted(tick)
         os.kill(os.getpid(), signal.SIGKILL)
         return

@@ -399,7 +399,7 @@ KINDS.add(
         step=arm.MotorStep(lambda fault: 0.0),
         parameters=(_joint(default=1),),
         detected_as=(Alarm.ACTUATOR,),
-        # The friction hides the fault for a time, which is more cycles if cycles are shorter.
+        # Dry friction hides the fault for a time, which is more cycles if cycles are shorter.
         bound=bounds.cycles_and_time(5, 12_500_000),
         lasts=draw.seconds(0.05, 0.4),
     ),

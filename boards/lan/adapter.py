@@ -257,12 +257,8 @@ class LanAdapter(Adapter):
                 return f"{len(peer.tokens)} racks are named '{peer.rack}'"
             if self._clocks.is_unanswered(peer, tick):
                 return f"clock of rack '{peer.rack}' is not known: it does not answer pings"
-        old_ports = [port for port, entry in self._imports.items() if entry.is_old(tick)]
-        return (
-            f"'{self._table.imports[old_ports[0]].source}' is older than max_age_ms"
-            if old_ports
-            else ""
-        )
+        ports = [port for port, entry in self._imports.items() if entry.is_old(tick)]
+        return f"'{self._table.imports[ports[0]].source}' is older than max_age_ms" if ports else ""
 
     def close(self) -> None:
         """Leave the network. In lockstep, first tell the other racks if the run is over."""

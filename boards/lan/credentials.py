@@ -138,6 +138,7 @@ class Credentials:
 
     @cached_property
     def _authorities(self) -> list[Certificate]:
+        """Certificates of the authority."""
         return load_certificates(self.authority)
 
     @property

@@ -142,6 +142,7 @@ class LanLink:
 
         def take_samples() -> Iterator[Any]:
             # Take at most one buffer's worth, so that a flood cannot prolong the cycle.
+            """Yield the samples in the buffer, oldest first."""
             for _ in range(unread):
                 if (sample := channel.try_recv()) is None:
                     return
@@ -158,6 +159,7 @@ class LanLink:
         """Call a function for each message under a key expression, in a thread of zenoh."""
 
         def pass_sample(sample: zenoh.Sample) -> None:
+            """Pass a sample on as a message."""
             callback(Arrived.of(sample))
 
         # Indirect callbacks would add the wake-up of another thread and an unbounded queue.
@@ -172,6 +174,7 @@ class LanLink:
         waiting = self._channel(self.session.declare_queryable, key, unread)
 
         def take_questions() -> Iterator[Question]:
+            """Yield the questions in the buffer, oldest first."""
             for query in waiting():
                 with query:
                     content = _bytes_of(query.payload) or b""
@@ -200,6 +203,7 @@ class LanLink:
         waiting = self._channel(declare, ALL_ALIVE, TOKENS, history=True)
 
         def take_changes() -> Iterator[tuple[str, int, bool]]:
+            """Yield the changes in the buffer, oldest first."""
             for sample in waiting():
                 key = str(sample.key_expr)
                 if (parsed := launch_and_cycle(key)) is not None:

@@ -24,22 +24,22 @@ def zero_counts(group: type[C]) -> C:
 
 
 class LanExport(Message, version=1):
-    """Counts of one export, in the status of the network adapter."""
+    """Counters of one export in the status of the network adapter."""
 
     sent: int = counter("messages sent")
     serial: int = field(unit="1", doc="serial of the newest message sent, 0 if there is none")
 
 
 class LanImport(Message, version=1):
-    """Counts of one import, and its newest message, in the status of the network adapter."""
+    """Counters of one import, and its newest message, in the status of the network adapter."""
 
     taken: int = counter("messages passed to the backplane")
-    missing: int = counter("messages sent that never came, or came after a later one")
-    disordered: int = counter("messages that came after a later one, and were not passed")
-    repeated: int = counter("messages that came twice")
-    late: int = counter("messages older than max_age_ms when they came")
+    missing: int = counter("messages that never arrived or arrived after a later one")
+    disordered: int = counter("messages that arrived after a later one and were not passed on")
+    repeated: int = counter("messages that arrived twice")
+    late: int = counter("messages that were older than max_age_ms when they arrived")
     refused: int = counter(
-        "messages refused: malformed, unsigned, oversized, or not what its type permits"
+        "messages refused because they are malformed, unsigned, oversized or of another type"
     )
     unknown_launch: int = counter("messages of a launch that is over, or not there")
     superseded: int = counter("messages that a newer one overtook before the exchange")
@@ -47,7 +47,9 @@ class LanImport(Message, version=1):
         unit="1",
         doc="launch that wrote the newest message taken, 0 if there is none or in lockstep",
     )
-    number: int = field(unit="1", doc="number of that message among those sent from its mailbox")
+    number: int = field(
+        unit="1", doc="number of that message among all messages sent from its mailbox"
+    )
     serial: int = field(unit="1", doc="its serial in its mailbox, 0 if there is none")
     age: int = field(
         unit="tick", doc="age of its information in this rack's ticks, -1 if there is none"
@@ -56,7 +58,7 @@ class LanImport(Message, version=1):
 
 
 class LanFlaws(Message, version=1):
-    """Counts of what came over the network and was dropped unread, by cause."""
+    """Counters of received messages that were dropped unread, by cause."""
 
     malformed: int = counter(
         "not of this protocol or of another version of it, always 0 in lockstep"
@@ -68,18 +70,20 @@ class LanFlaws(Message, version=1):
 
 
 class LanClocks(Message, version=1):
-    """Counts of the round trips by which racks compare their clocks."""
+    """Counters of the round trips by which racks compare their clocks."""
 
     taken: int = counter("round trips measured")
     answered: int = counter("pings of other racks answered")
-    withheld: int = counter("pings not answered: they came too fast, or from too many racks")
+    withheld: int = counter(
+        "pings not answered because they arrived too fast or from too many racks"
+    )
     refused: int = counter(
-        "pings and answers refused: malformed, unsigned, or to nothing that was asked"
+        "pings and answers refused because they are malformed, unsigned or unexpected"
     )
 
 
 class LanDesk(Message, version=1):
-    """Counts of the emergency stops that other machines asked for."""
+    """Counters of the emergency stops that other machines requested."""
 
     answered: int = counter(
         "emergency stops from other machines that were set, always 0 in lockstep"
@@ -99,6 +103,6 @@ def status_of(exports: Iterable[str], imports: Iterable[str]) -> type[Status]:
         **{f"export_{port}": field(LanExport, doc=f"export {port}") for port in exports},
         **{f"import_{port}": field(LanImport, doc=f"import {port}") for port in imports},
         "desk": field(LanDesk, doc="emergency stops from other machines"),
-        "flaws": field(LanFlaws, doc="all that came and was dropped unread, by cause"),
+        "flaws": field(LanFlaws, doc="messages that were dropped unread, by cause"),
     }
     return make_message("lan_status", 1, Status, groups)

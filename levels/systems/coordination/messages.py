@@ -78,9 +78,11 @@ class CellAction(Message):
     turned: bool = field(doc="whether a transfer turns the object to `yaw`")
     yaw: float = field(unit="rad", doc="turn of the object's x axis about the vertical")
     lift: float = field(unit="m", doc="height of a transfer's straight motions")
-    quaternion: ndarray = field(unit="1", doc="of the tool, for goal pose", shape=4)
-    direction: ndarray = field(unit="1", doc="of the tool's z axis, for goal direction", shape=3)
-    count: int = integer("joints that follow", "u1")
+    quaternion: ndarray = field(unit="1", doc="orientation of the tool, for goal pose", shape=4)
+    direction: ndarray = field(
+        unit="1", doc="direction of the tool's z axis, for goal direction", shape=3
+    )
+    count: int = integer("number of values in `joints`", "u1")
     joints: ndarray = field(unit="rad", doc="joint positions, for goal joints", shape=MAX_JOINTS)
     by: float = field(unit="s", doc="simulated time by which it must be done, 0 for any time")
 
@@ -88,10 +90,12 @@ class CellAction(Message):
 class OrderHead(Command):
     """Head of an order, without its action."""
 
-    program: int = integer("checksum of the program that the order is of")
-    what: OrderVerb = field(doc="ask, do, cancel: all of the order `id`; end")
-    hold: bool = field(doc="1: the arm rests on its path while it does an order")
-    reason: str = field(doc="with `hold` why; with END why the program failed, empty: it is done")
+    program: int = integer("checksum of the program to which the order belongs")
+    what: OrderVerb = field(doc="what to do with the order `id`, or the end of the program")
+    hold: bool = field(doc="whether the arm must rest on its path while it carries out an order")
+    reason: str = field(
+        doc="reason for `hold`, or with END why the program failed, empty after success"
+    )
 
 
 class CellOrder(OrderHead, CellAction, version=1):
@@ -102,9 +106,9 @@ class CellReport(Status, version=1):
     """Report of a task level to the rack that orders its actions."""
 
     error: Error = field("u2", doc="error code of the level, 0 if there is none")
-    program: int = integer("as in the order that is echoed")
+    program: int = integer("checksum of the program of the echoed order")
     response: Response = field(
-        doc="the answer to it; `reason`: of a refusal or failure, else of waiting"
+        doc="answer to the echoed order; `reason` says why it is refused, has failed or waits"
     )
     earliest: float = field(
         unit="s",
@@ -117,7 +121,7 @@ class CellReport(Status, version=1):
     moves_done: int = integer("elemental moves of the order done", "u2")
     moves: int = integer("elemental moves of the order; 0 before it begins", "u2")
     halted: bool = field(
-        doc="1: moves were withdrawn, the arm is held until it begins another order"
+        doc="whether moves were withdrawn, so that the arm is held until it begins another order"
     )
     operated: bool = OPERATED
 
@@ -126,17 +130,17 @@ class RequestHead(Message):
     """Head of a request for a plan, without its action."""
 
     id: int = integer("serial of the plan wanted, 0 if there is none")
-    program: int = integer("as in the order that it serves")
-    order: int = integer("that order")
+    program: int = integer("checksum of the program of the order")
+    order: int = integer("id of the order")
     begin: float = field(
         unit="s", doc="simulated time at which it must be possible to begin, 0 for at once"
     )
     ahead: float = field(
         unit="s",
-        doc=("simulated time of the rack that gave the order, in which `by` is, less that here"),
+        doc="time of the rack that gave the order, to which `by` refers, minus the time here",
     )
-    revision: int = integer("of the world model then")
-    start: ndarray = per_joint("rad", "where the arm rested then")
+    revision: int = integer("revision of the world model at the request")
+    start: ndarray = per_joint("rad", "where the arm rested at the request")
 
 
 class CellRequest(RequestHead, CellAction, version=1):
@@ -146,11 +150,11 @@ class CellRequest(RequestHead, CellAction, version=1):
 class CellProgress(Message, version=2):
     """State of a coordinator, from which it continues after a restart of its board."""
 
-    phase: Phase = field(doc="of the present step")
+    phase: Phase = field(doc="activity in the present step")
     step: int = integer("steps done", "u2")
-    attempt: int = integer("times that the present step was asked for before", "u2")
+    attempt: int = integer("number of earlier attempts at the present step", "u2")
     error: Error = field("u2", doc="why the program ends early, 0 if it does not")
-    reason: str = field(doc="the error, readable")
+    reason: str = field(doc="the error as text")
     ending: float = field(
         unit="s", doc="simulated time since when the arms are being ended, 0 before that"
     )

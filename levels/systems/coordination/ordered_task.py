@@ -280,7 +280,7 @@ class OrderedTaskExecutor(TaskExecutor):
             super()._check_progress(plan, waits, tick)
 
     def _stage(self) -> tuple[int, ...]:
-        """Return everything that changes while orders are processed."""
+        """Return a tuple that changes whenever the orders make progress."""
         return self._taken.order, self._taken.response, self._begun, not self._absent
 
     def _report(self, plan: TaskPlan, waits: str) -> None:

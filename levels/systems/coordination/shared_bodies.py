@@ -38,14 +38,14 @@ class SharedBodyEntry(Message, version=1, message="shared_body"):
     name: str = field(f"S{NAME_BYTES}", doc="name of the body in the model, empty if there is none")
     claim: int = integer("number of the claim that this rack knows to be valid, 0 if there is none")
     owner: str = field(
-        f"S{NAME_BYTES}", doc="rack whose claim that is: its simulation moves the body"
+        f"S{NAME_BYTES}", doc="rack that made the claim, whose simulation moves the body"
     )
-    touched: bool = field(doc="1: the gripper of this rack touches it")
+    touched: bool = field(doc="whether the gripper of this rack touches it")
     position: np.ndarray = field(
         unit="m", doc="body origin in this rack's simulation", shape=3, length=(0.0, FARTHEST_M)
     )
     quaternion: np.ndarray = field(
-        unit="1", doc="body orientation, likewise", shape=4, length=(0.999, 1.001)
+        unit="1", doc="body orientation in this rack's simulation", shape=4, length=(0.999, 1.001)
     )
 
 

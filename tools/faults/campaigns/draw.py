@@ -349,6 +349,7 @@ def _ordered(room_ticks: int, cards: Sequence[Card], rng: Random) -> list[Card]:
     orders = [rng.sample(cards, len(cards)) for _ in range(SHUFFLES)]
 
     def rate_order(order: list[Card]) -> tuple[bool, int]:
+        """Rate an order: whether all faults fit, and how late the first fault of the arm comes."""
         needed = max(accumulate(card.room for card in order))
         cards_before = takewhile(lambda card: card.target.record.where != "arm", order)
         return needed <= room_ticks, sum(card.window for card in cards_before)

@@ -311,12 +311,11 @@ def _trial(run: TrialResult) -> Document:
     }
 
 
-def _rate(rate_of_events: EventRate | None) -> str:
+def _rate(event_rate: EventRate | None) -> str:
     """Format a rate with its confidence bound."""
-    if rate_of_events is None:
+    if event_rate is None:
         return "-"
-    bound = f"below {rate_of_events.below:.3g} with 95 % confidence"
-    return f"{rate_of_events.an_hour:.3g} an hour, {bound}"
+    return f"{event_rate.an_hour:.3g} an hour, below {event_rate.below:.3g} with 95 % confidence"
 
 
 def _kind_row(kind: str, figures: KindFigures) -> list[str]:
