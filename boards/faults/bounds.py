@@ -213,7 +213,7 @@ MUTE = Bound(
     counting(MISSING_WRITES, "write"),
     lambda case: None if case.role == "planner" else MISSING_WRITES * case.write,
 )
-"""No bound for a planner, which does not write at a fixed period."""
+"""Time after which a mailbox is mute. None for a planner, which does not write periodically."""
 DELAY = Bound("the delay", lambda case: int(case.parameters["by"]) * case.write)
 SKIP = Bound(
     "the next cycle of the fastest boards",

@@ -253,7 +253,7 @@ class FaultyWriter:
         self._show()
 
     def _show(self) -> None:
-        """Publish the number of delayed messages and the state of the writer in the segment."""
+        """Update the count of delayed messages and show published messages to readers."""
         self._writer.held = len(self._late) + sum(len(step.held) for step in self._steps.values())
         self._writer.show()
 

@@ -103,7 +103,7 @@ class LanAdapter(Adapter):
 
     @classmethod
     def replayed(cls, params: Mapping[str, Any], layout: Layout) -> Mapping[str, bool]:
-        """Return all ports that the adapter writes. Only imports are sent message by message."""
+        """Return the ports that are written in a replay. Only imports are sent one by one."""
         imports = read_params(LanTable, params).imports
         return {port: port in imports for port in cls.made_ports(params, {}).outputs}
 

@@ -394,7 +394,7 @@ class Barrier:
             )
 
     def _refuse(self, why: str) -> NoReturn:
-        """End this board with the reason why the racks cannot run in lockstep."""
+        """Raise `CannotGoOn`, which ends this board, with the reason why lockstep is impossible."""
         self._has_refused = True
         raise CannotGoOn(why)
 

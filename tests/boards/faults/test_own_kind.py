@@ -36,7 +36,7 @@ def fault(keys: str) -> str:
     return f'fault=[{{ kind = "lose-every", board = "wave", {keys} }}]'
 
 
-def test_a_kind_of_a_users_own_is_listed_with_its_bound_and_parameters(config: MakeConfig) -> None:
+def test_a_users_kind_is_listed_with_its_bound_and_parameters(config: MakeConfig) -> None:
     wire(config(text=GAUGED))
     lines = [line.split("  ") for line in kinds_text() if line.startswith("lose-every ")]
     kind, parameter = ([cell.strip() for cell in line if cell] for line in lines)
@@ -45,7 +45,7 @@ def test_a_kind_of_a_users_own_is_listed_with_its_bound_and_parameters(config: M
 
 
 @pytest.mark.parametrize("valve", ["open", "OPEN", "3"])
-def test_a_fault_begins_when_a_field_has_a_value_of_a_users_own_enum(
+def test_a_fault_begins_when_a_field_has_a_value_of_a_users_enum(
     config: MakeConfig, valve: str
 ) -> None:
     found = config(fault(f'cycles = 80, when = "wave.status.valve == {valve}"'), text=GAUGED)
@@ -59,7 +59,7 @@ def test_a_fault_begins_when_a_field_has_a_value_of_a_users_own_enum(
 
 
 @pytest.mark.slow
-def test_a_kind_of_a_users_own_acts_and_is_detected(config: MakeConfig) -> None:
+def test_a_users_kind_acts_and_is_detected(config: MakeConfig) -> None:
     with Rack(
         config(fault('cycles = 80, n = 4, when = "wave.status.valve == open"'), text=GAUGED)
     ) as rack:

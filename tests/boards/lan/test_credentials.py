@@ -61,7 +61,7 @@ def test_a_file_that_cannot_be_read_is_named(folder: Path) -> None:
     ]
 
 
-def test_what_others_may_read_is_refused(folder: Path) -> None:
+def test_a_key_that_others_can_read_is_refused(folder: Path) -> None:
     (folder / "cell-key.pem").chmod(0o640)
     assert flaws(folder) == ["cell-key.pem: mode 0640 lets others read it; it must be 0600"]
 
@@ -80,7 +80,7 @@ def test_a_certificate_is_for_the_addresses_on_which_the_rack_listens(made: Path
     )
 
 
-def test_the_key_must_be_that_of_the_certificate(folder: Path) -> None:
+def test_the_key_must_belong_to_the_certificate(folder: Path) -> None:
     shutil.copy(folder / "puma-key.pem", folder / "cell-key.pem")
     assert flaws(folder) == ["cell-key.pem: the key does not belong to cell.pem"]
 
@@ -94,7 +94,7 @@ def test_a_key_with_a_password_is_refused(folder: Path) -> None:
     assert flaws(folder) == ["cell-key.pem: the key is encrypted; it must have no password"]
 
 
-def test_another_authority_has_not_signed_it(folder: Path, tmp_path: Path) -> None:
+def test_a_certificate_of_another_authority_is_refused(folder: Path, tmp_path: Path) -> None:
     make_credentials(tmp_path / "other", NAMES, 2)
     shutil.copy(tmp_path / "other/authority.pem", folder / "authority.pem")
     assert flaws(folder) == ["cell.pem: the certificate is not signed by authority.pem"]
@@ -104,7 +104,7 @@ def test_another_authority_has_not_signed_it(folder: Path, tmp_path: Path) -> No
 @pytest.mark.parametrize(
     "content", [b"nothing", b"-----BEGIN CERTIFICATE-----\nAAAA\n-----END CERTIFICATE-----\n"]
 )
-def test_what_is_not_pem_is_refused(folder: Path, name: str, content: bytes) -> None:
+def test_files_that_are_not_pem_are_refused(folder: Path, name: str, content: bytes) -> None:
     (folder / name).write_bytes(content)
     kind = "private key" if "key" in name else "certificate"
     assert f"{name}: the file contains no {kind} in PEM form" in flaws(folder)
@@ -128,7 +128,7 @@ def test_a_key_of_another_kind_is_refused(folder: Path) -> None:
         (1, 2, "cell.pem: the certificate is not valid before 20"),
     ],
 )
-def test_a_certificate_of_other_days_is_refused(
+def test_a_certificate_that_is_not_valid_now_is_refused(
     folder: Path, begins: int, ends: int, why: str
 ) -> None:
     now = datetime.now(UTC)

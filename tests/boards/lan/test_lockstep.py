@@ -98,7 +98,9 @@ def test_an_adapter_killed_at_a_tick_comes_back_and_the_run_repeats(
     assert struck.last["lan.status"]["import_other"]["superseded"] > 0
 
 
-def test_a_killed_rack_is_given_up_and_the_others_go_on(names: list[str], tmp_path: Path) -> None:
+def test_a_killed_rack_is_given_up_and_the_others_continue(
+    names: list[str], tmp_path: Path
+) -> None:
     texts = ring_texts(names[:2])
     texts[0] = texts[0].replace("lan_levels:Echo", "hasty_levels:Echo")
     racks = configs(texts, tmp_path, STEPPED)
@@ -120,7 +122,9 @@ def test_a_killed_rack_is_given_up_and_the_others_go_on(names: list[str], tmp_pa
         assert ended(rack).last[f"lan.{peer_port(names[1])}"]["presence"] == Presence.LOST
 
 
-def test_a_rack_started_anew_takes_no_part_and_says_why(names: list[str], tmp_path: Path) -> None:
+def test_a_rack_that_is_started_again_takes_no_part_and_says_why(
+    names: list[str], tmp_path: Path
+) -> None:
     racks = configs(ring_texts(names[:2]), tmp_path, STEPPED)
     with running(racks[:1]) as (rack,):
         # Hold before the start, or the run may be over before the other rack is started again.

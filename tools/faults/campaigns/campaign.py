@@ -112,7 +112,7 @@ class Campaign:
         """Do everything that is not done yet, until the end or until Ctrl-C.
 
         Raises:
-            Failure: The task is not done even without faults, or the folder has another campaign.
+            Failure: The task is not done even without faults, or another campaign uses the folder.
         """
         order = self.order
         self._open()
@@ -142,7 +142,7 @@ class Campaign:
         return results
 
     def _open(self) -> None:
-        """Create the folder or continue in it. Raises `Failure` if it has another campaign."""
+        """Create the folder or continue in it. Raises `Failure` if another campaign uses it."""
         path = self.folder / ORDER
         wanted = json.loads(encode_json(self.order.document()))
         if path.exists():
@@ -150,7 +150,8 @@ class Campaign:
             if differing_keys := [key for key in wanted if wanted[key] != stored.get(key)]:
                 differing = ", ".join(key.replace("_", " ") for key in differing_keys)
                 raise Failure(
-                    f"--out {self.folder} has another campaign, which differs in {differing}", 2
+                    f"--out {self.folder} belongs to a campaign that differs in {differing}",
+                    2,
                 )
             return
         self.folder.mkdir(parents=True, exist_ok=True)

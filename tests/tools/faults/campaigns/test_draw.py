@@ -112,7 +112,7 @@ def _undone(kind: str, board: str, course: RackUnderTest) -> int:
     return KINDS[kind].recovery_ticks(board, course.targets.layout, course.restart_s)
 
 
-def test_a_mailbox_is_struck_again_only_where_its_readers_would_tell_of_it_again(
+def test_a_mailbox_is_affected_again_only_if_its_readers_would_report_it(
     course: RackUnderTest,
 ) -> None:
     layout, again = course.targets.layout, 0
@@ -149,7 +149,7 @@ def _lasts(table: Mapping[str, Any]) -> int:
         (" , ", False, "--kinds names no kind; valid kinds: "),
     ],
 )
-def test_a_kind_that_cannot_be_is_refused_in_one_line(
+def test_an_impossible_kind_is_refused_in_one_line(
     course: RackUnderTest, wanted: str, lockstep: bool, why: str
 ) -> None:
     with pytest.raises(Failure) as refused:

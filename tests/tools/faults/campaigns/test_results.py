@@ -91,12 +91,12 @@ BAD = [
 
 
 @pytest.mark.parametrize(("bad", "line"), BAD)
-def test_each_shortfall_is_a_line(bad: Trial, line: str) -> None:
+def test_each_shortfall_is_one_line(bad: Trial, line: str) -> None:
     assert (result_of(GOOD).ended, result_of(GOOD).shortfalls) == ("task done", ())
     assert result_of(bad).shortfalls == (line,)
 
 
-def test_a_task_is_safely_stopped_when_the_arm_stands_and_no_limit_was_violated() -> None:
+def test_a_task_is_safely_stopped_if_the_arm_is_at_rest_within_its_limits() -> None:
     lost = replace(GOOD, outcome=outcome("board lost", "board 'lower' ended"))
     assert result_of(lost).ended == "safely stopped"
     assert result_of(replace(lost, arm=ArmEnd(is_at_rest=False))).ended == "neither"
@@ -148,7 +148,7 @@ def test_trips_are_counted_by_the_hour_and_misses_beside_them() -> None:
     assert [run.stray_misses for run in calm] == [2, 0]
 
 
-def test_a_trial_is_kept_in_a_file_that_is_there_as_a_whole_or_not_at_all(tmp_path: Path) -> None:
+def test_a_trial_is_saved_atomically(tmp_path: Path) -> None:
     made = trial(SEEN, FLOWS, found(9000, "gap", "upper", "lower.status"))
     path = tmp_path / "trials" / "1.json"
     assert kept(path) is None

@@ -73,7 +73,7 @@ def test_a_trial_that_cannot_be_made_ends_the_campaign_with_its_reason(
         list(workers.run([bad], alone=False))
 
 
-def test_after_a_signal_nothing_is_begun(
+def test_no_trial_begins_after_a_signal(
     config: RackConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(INTERRUPT, "number", 2)
