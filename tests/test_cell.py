@@ -54,15 +54,15 @@ def test_a_rack_may_share_with_several_others(tmp_path: Path) -> None:
 MISTAKES = {
     "unknown": (
         'board.servo.params.shared=["prt"]',
-        'board.servo.params.shared = "prt": not in the scene; objects: part',
+        'board.servo.params.shared = "prt": is not in the scene; valid objects: part',
     ),
     "twice": (
         'board.servo.params.shared=["part", "part"]',
-        'board.servo.params.shared = "part": named twice',
+        'board.servo.params.shared = "part": is named more than once',
     ),
     "no copies": (
         "board.servo.params.arm=rack.levels.arm:SimulatedArm",
-        "the arm shares no objects; permitted:"
+        "this arm cannot share objects; it must be"
         " rack.levels.systems.coordination.sharing_arm:SharingArm",
     ),
     "from nowhere": ("board.servo.reads.others=lan.shred", '"lan.shred": no task writes it'),
@@ -95,4 +95,6 @@ def test_an_obstacle_cannot_be_shared(tmp_path: Path) -> None:
                 ['board.servo.params.shared=["post"]', "task.action=[]", "scene.goal=[]"],
             )
         )
-    assert "an obstacle, which moves by itself; objects: block1, block2, peg" in str(error.value)
+    assert "is an obstacle, which moves by itself; valid objects: block1, block2, peg" in str(
+        error.value
+    )

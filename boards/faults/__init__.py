@@ -1,6 +1,7 @@
-"""Faults: their kinds, one record each, and the steps that act them.
+"""Fault kinds, one record each, and the steps that carry them out.
 
-`KINDS` holds the kinds known to this process; `rack.boards.faults.kind` explains how to add one.
+`KINDS` contains the kinds that this process knows. `rack.boards.faults.kind` explains how to add
+one.
 """
 
 import rack.boards.faults.kinds  # noqa: F401  adds the project's own kinds

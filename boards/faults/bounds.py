@@ -1,13 +1,12 @@
-"""Detection bounds: the ticks within which a fault must be detected, counted from the tick at which
-it first shows.
+"""Detection bounds: numbers of ticks within which a fault must be detected.
 
-Most faults show as soon as they act. One of the arm may act at first by less than friction, a
-contact or a creeping joint hides: no detector can tell it from a sound arm, so until then no bound
-runs.
+A bound is counted from the tick at which the fault first shows. Most faults show as soon as they
+act. A fault of the arm may at first have a smaller effect than friction, a contact or a slow joint.
+No detector could tell such an arm from a working one, so the bound starts later.
 
-A bound is a sum of terms. Each term has a text and computes its ticks: one source for help,
-judgement and tests. A cycle is that of the affected task; a planner's is its time slice. A message
-is delivered at its reader's first read after it becomes visible.
+A bound is a sum of terms. Each term has a text and computes its ticks; help, judgement and tests
+all use the same terms. A cycle is a cycle of the affected task; for a planner it is the time slice.
+A message is delivered at its reader's first read after it becomes visible.
 """
 
 from __future__ import annotations
@@ -23,22 +22,25 @@ from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.mailbox.protocols import LOCK_WAIT_S
 
 RACK_NS = 5_000_000
-"""The Rack learns of a process's death within this time, from the kernel, by pidfd."""
+"""Time within which the kernel tells the Rack of a process's death, by pidfd."""
 MEMORY_NS = 45_000_000
-"""Real time that the kernel may first take to free the memory of a killed process: up to 0.5 ms per
-megabyte on a busy machine, and a planner with its libraries has 80 MB."""
+"""Real time that the kernel may need to free the memory of a killed process.
+
+Up to 0.5 ms per megabyte were seen on a busy machine, and a planner with its libraries has 80 MB.
+"""
 
 
 def cycle_ticks(layout: Layout, board: str) -> int:
-    """Return the cycle of a task, in ticks; a planner's is its time slice, the clock's one tick."""
+    """Return the cycle of a task in ticks: for a planner its time slice, for the clock one tick."""
     if board == CLOCK:
         return 1
     return layout.task(board).slice
 
 
 def last_read(mailboxes: tuple[str, ...], layout: Layout) -> int:
-    """Return the ticks from the last message in any of these mailboxes until its slowest reader has
-    read it.
+    """Return the time until the last message in any of these mailboxes has been read, ticks.
+
+    It is counted from the message's release to the read of the slowest reader.
     """
     boxes = [layout.mailbox(name) for name in mailboxes]
     return max(
@@ -48,22 +50,40 @@ def last_read(mailboxes: tuple[str, ...], layout: Layout) -> int:
 
 
 def struck_mailboxes(layout: Layout, at: int, board: str) -> tuple[MailboxSpec, ...]:
-    """Return the mailboxes that a fault of a task concerns: that with index `at`; -1: all that it
-    writes.
+    """Return the mailboxes that a fault of a task affects.
+
+    Args:
+        layout: Layout of the rack.
+        at: Index of the mailbox. -1 means all mailboxes that the task writes.
+        board: Name of the task. Mailboxes that it does not write are left out.
     """
     chosen = layout.mailboxes if at < 0 else layout.mailboxes[at : at + 1]
     return tuple(mailbox for mailbox in chosen if mailbox.writer == board)
 
 
 def between_reads(layout: Layout, mailbox: MailboxSpec, reader: str) -> int:
-    """Return the longest time between a task's reads of a mailbox, in ticks."""
+    """Return the longest interval between a task's reads of a mailbox.
+
+    Args:
+        layout: Layout of the rack.
+        mailbox: The mailbox.
+        reader: Name of the reading task.
+
+    Returns:
+        The interval in ticks.
+    """
     return max(cycle_ticks(layout, reader), layout.read_grid(mailbox, reader).every)
 
 
 @dataclass(frozen=True)
 class BoundCase:
-    """The facts about a fault that decide its bound. `reader` is the task that detects it; None:
-    the first to do so.
+    """Facts about a fault that determine its bound.
+
+    Attributes:
+        layout: Layout of the rack.
+        injection: The fault.
+        parameters: Values of the fault's parameters, by name.
+        reader: Task that detects the fault. None stands for whichever task is first.
     """
 
     layout: Layout
@@ -73,14 +93,12 @@ class BoundCase:
 
     @cached_property
     def board(self) -> str:
-        """The task that the fault strikes; "clock" for the clock."""
+        """Name of the affected task, or "clock"."""
         return CLOCK if self.injection.task < 0 else self.layout.processes[self.injection.task].name
 
     @cached_property
     def mailboxes(self) -> tuple[MailboxSpec, ...]:
-        """The affected mailboxes that the reader reads; without a `reader`, those that any task
-        reads.
-        """
+        """Affected mailboxes that the reader reads or, if no reader is given, any task reads."""
         struck = struck_mailboxes(self.layout, self.injection.mailbox, self.board)
         if self.reader:
             return tuple(mailbox for mailbox in struck if self.reader in mailbox.readers)
@@ -88,39 +106,42 @@ class BoundCase:
 
     @property
     def role(self) -> str:
-        """Role of the task; "clock" for the clock."""
+        """Role of the affected task, or "clock"."""
         return CLOCK if self.board == CLOCK else self.layout.task(self.board).role
 
     @property
     def cycle(self) -> int:
-        """The task's cycle, in ticks."""
+        """Cycle of the affected task, ticks."""
         return cycle_ticks(self.layout, self.board)
 
     @property
     def write(self) -> int:
-        """Ticks between messages in the slowest mailbox."""
+        """Interval between messages in the slowest affected mailbox, ticks."""
         return max(mailbox.every for mailbox in self.mailboxes)
 
     @property
     def read(self) -> int:
-        """Longest time between reads, ticks: by the reader, or by the fastest reader of each
-        mailbox.
+        """Longest interval between reads of an affected mailbox, ticks.
+
+        It applies to the reader or, if no reader is given, to the fastest reader of each mailbox.
         """
-        between = partial(between_reads, self.layout)
+        read_interval = partial(between_reads, self.layout)
         if self.reader:
             return max(
-                (between(m, self.reader) for m in self.mailboxes),
+                (read_interval(m, self.reader) for m in self.mailboxes),
                 default=cycle_ticks(self.layout, self.reader),
             )
         return max(
-            (min(between(m, reader) for reader in m.readers) for m in self.mailboxes), default=0
+            (min(read_interval(m, reader) for reader in m.readers) for m in self.mailboxes),
+            default=0,
         )
 
 
 @dataclass(frozen=True)
 class Bound:
-    """A detection bound, as text and in ticks. `ticks` returns None if there is no bound, or if
-    this process knows only the text.
+    """A detection bound, as text and in ticks.
+
+    `ticks` returns None if there is no bound, or if this process knows only the text.
     """
 
     text: str
@@ -130,40 +151,45 @@ class Bound:
         return self.text
 
     def __add__(self, other: Bound) -> Bound:
-        def ticks(case: BoundCase) -> int | None:
+        def add_terms(case: BoundCase) -> int | None:
+            """Add the ticks of both bounds, if both have any."""
             terms = self.ticks(case), other.ticks(case)
             return None if None in terms else sum(term for term in terms if term is not None)
 
-        return Bound(f"{self.text} + {other.text}", ticks)
+        return Bound(f"{self.text} + {other.text}", add_terms)
 
 
 def counting(number: float, noun: str) -> str:
-    """Return a number with its noun, as in "1 tick" or "3 ticks"."""
+    """Format a number with its noun, such as "1 tick" or "3 ticks"."""
     text = f"{number:.0f}" if abs(number) < float("inf") else str(number)
     return f"1 {noun}" if text == "1" else f"{text} {noun}s"
 
 
 def cycles(count: int) -> Bound:
-    """Return a bound of `count` cycles of the task; 0: the cycle in which the fault strikes. A host
-    board has none.
+    """Return a bound of `count` cycles of the task. 0 stands for the cycle in which the fault acts.
+
+    A fault of a host board has no such bound.
     """
 
-    def ticks(case: BoundCase) -> int | None:
+    def count_ticks(case: BoundCase) -> int | None:
+        """Count the ticks of these cycles."""
         return None if case.role == "host" else count * case.cycle
 
     text = counting(count, "cycle") if count else "the same cycle"
-    return Bound(text, ticks)
+    return Bound(text, count_ticks)
 
 
 def cycles_and_time(count: int, time_ns: int) -> Bound:
-    """Return a bound of `count` cycles of the task, but at least a time, in which a controller's
-    gains take effect.
+    """Return a bound of `count` cycles of the task that is at least `time_ns` long.
+
+    The gains of a controller act in time, not in cycles.
     """
 
-    def ticks(case: BoundCase) -> int:
+    def count_ticks(case: BoundCase) -> int:
+        """Count the ticks of these cycles, at least of this time."""
         return max(count * case.cycle, ceil(time_ns / case.layout.clock_ns))
 
-    return Bound(f"{counting(count, 'cycle')}, at least {time_ns * 1e-6:g} ms", ticks)
+    return Bound(f"{counting(count, 'cycle')}, at least {time_ns * 1e-6:g} ms", count_ticks)
 
 
 def clock_ticks(count: int) -> Bound:
@@ -172,7 +198,7 @@ def clock_ticks(count: int) -> Bound:
 
 
 def writes(count: int) -> Bound:
-    """Return a bound of `count` periods of the mailbox's writer."""
+    """Return a bound of `count` writing periods of the slowest affected mailbox."""
     return Bound(counting(count, "write"), lambda case: count * case.write)
 
 
@@ -180,14 +206,14 @@ READ = Bound("1 read", lambda case: case.read)
 DELIVERY = Bound(
     "1 delivery", lambda case: max(mailbox.delay for mailbox in case.mailboxes) + case.read
 )
-"""From the writer's release until its message has been read."""
+"""Time from the writer's release until a reader has read the message."""
 MISSING_WRITES = 2
-"""Periods without a message after which a mailbox is stale."""
+"""Number of writing periods without a message after which a mailbox is stale."""
 MUTE = Bound(
     counting(MISSING_WRITES, "write"),
     lambda case: None if case.role == "planner" else MISSING_WRITES * case.write,
 )
-"""A planner writes at no fixed period: there is no bound."""
+"""Time after which a mailbox is mute. None for a planner, which does not write periodically."""
 DELAY = Bound("the delay", lambda case: int(case.parameters["by"]) * case.write)
 SKIP = Bound(
     "the next cycle of the fastest boards",
@@ -195,7 +221,7 @@ SKIP = Bound(
         int(case.parameters["ticks"]), min(task.every for task in case.layout.tasks) - 1
     ),
 )
-"""A release that was skipped comes in the first tick that is not."""
+"""Skipped releases are noticed in the first tick that is not skipped."""
 DEATH_CYCLES = 4
 DEATH = Bound(
     f"{RACK_NS * 1e-6:g} ms (Rack), {DEATH_CYCLES} cycles + 1 read (reader)",
@@ -205,10 +231,10 @@ DEATH = Bound(
         else DEATH_CYCLES * case.cycle + case.read
     ),
 )
-"""Seen by the Rack, or by a reader whose message is then so many cycles old."""
+"""A death is noticed by the Rack, or by a reader once the newest message is too old."""
 SLICE = Bound("1 time slice", lambda case: case.cycle)
 RELEASE = Bound("1 cycle", lambda case: case.layout.task(case.board).every)
-"""From one release of the task to the next; a planner has several in its time slice."""
+"""Interval between two releases of the task. A planner has several in its time slice."""
 LOCK_WAIT = Bound(
     "the lock's time-out", lambda case: ceil(LOCK_WAIT_S * 1e9 / case.layout.clock_ns)
 )

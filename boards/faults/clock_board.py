@@ -1,7 +1,7 @@
-"""Faults as directed by the clock's board: each waits, becomes active and ends, at ticks.
+"""Faults as directed by the clock's board: each one waits, becomes active and ends at ticks.
 
-The board itself acts the faults that no task can: signals to processes, forged messages, faults of
-its own ticks.
+The board itself carries out the faults that no task can: signals to processes, forged messages, and
+faults of the clock's ticks.
 """
 
 from __future__ import annotations
@@ -30,24 +30,28 @@ from rack.boards.faults.message_steps import Babble, forge
 
 OPEN = (Stage.WAITING, Stage.ACTIVE)
 PHASES = 1000
-"""Resolution of a phase, per tick."""
+"""Number of steps into which a phase divides a tick."""
 LEAST_LATE = 0.6
-"""Smallest delay of a tick, in ticks; boards call a tick late from 0.5 on."""
+"""Smallest delay of a late tick, in ticks. Boards report a tick as late from 0.5 on."""
 
 
 Strike = Callable[["FaultStage", FaultEntry, int], None]
-"""What is done to a rack for an entry of the fault table, at a tick."""
+"""Carries out one step of a fault: takes the stage, the entry of the fault table, and the tick."""
 
 
-def _nothing(rack: FaultStage, entry: FaultEntry, tick: int) -> None:
+def _nothing(stage: FaultStage, entry: FaultEntry, tick: int) -> None:
     """Do nothing."""
 
 
 @dataclass(frozen=True)
 class ClockStep:
-    """A step of the clock's board: as the fault begins, in each of its ticks, and as it ends.
+    """Steps of a fault that the clock's board carries out.
 
-    `is_void` says whether a fault has lost its object and ends early.
+    Attributes:
+        begin: Called when the fault begins.
+        during: Called in each tick while it is active.
+        end: Called when it ends.
+        is_void: Returns True if the affected process is gone, so that the fault ends early.
     """
 
     begin: Strike = _nothing
@@ -56,66 +60,75 @@ class ClockStep:
     is_void: Callable[[FaultStage, FaultEntry], bool] = lambda rack, entry: False
 
 
-def _kill(rack: FaultStage, entry: FaultEntry, tick: int) -> None:
-    task = rack.target(entry)
+def _kill(stage: FaultStage, entry: FaultEntry, tick: int) -> None:
+    """Kill a task's process, or the clock itself. Wait until the crate has recorded the loss."""
+    task = stage.target(entry)
     if task is None:
-        # The clock kills itself: its successor finds the entry struck.
+        # The clock kills itself. Mark the entry first, so that the restarted clock does not do it
+        # again.
         entry.acted(tick)
         os.kill(os.getpid(), signal.SIGKILL)
         return
-    # The crate marks the task lost, then counts the loss. The system controller acts on the count:
-    # wait for both.
-    words = rack.segment.words
-    before = words[System.LOSSES]
-    if rack.send(entry, tick, task, signal.SIGKILL):
-        rack.driver.await_state(task, lambda: task.is_lost and words[System.LOSSES] != before)
+    # The crate first marks the task as lost, then counts the loss, on which the system controller
+    # acts. Wait for both.
+    words = stage.segment.words
+    losses = words[System.LOSSES]
+    if stage.send(entry, tick, task, signal.SIGKILL):
+        stage.driver.await_state(task, lambda: task.is_lost and words[System.LOSSES] != losses)
 
 
-def _hang(rack: FaultStage, entry: FaultEntry, tick: int) -> None:
-    task = rack.target(entry)
-    if task is not None and rack.send(entry, tick, task, signal.SIGSTOP):
+def _hang(stage: FaultStage, entry: FaultEntry, tick: int) -> None:
+    """Stop a task's process."""
+    task = stage.target(entry)
+    if task is not None and stage.send(entry, tick, task, signal.SIGSTOP):
         task.is_stopped = True
         if task.spec.role == "host":
-            # The Rack ends its process some time; lockstep waits for that here.
-            rack.driver.await_state(task, lambda: task.is_lost)
+            # The Rack kills a stopped host board at an unknown time, for which lockstep must wait.
+            stage.driver.await_state(task, lambda: task.is_lost)
 
 
-def _continue(rack: FaultStage, entry: FaultEntry, tick: int) -> None:
-    task = rack.target(entry)
+def _continue(stage: FaultStage, entry: FaultEntry, tick: int) -> None:
+    """Let a stopped process continue, unless the Rack has killed it."""
+    task = stage.target(entry)
     if task is not None and task.is_stopped and not task.is_lost:
         with suppress(ProcessLookupError):
             os.kill(task.block[Block.PID], signal.SIGCONT)
         task.is_stopped = False
-        rack.driver.settle()
+        stage.driver.settle()
 
 
-def _is_lost(rack: FaultStage, entry: FaultEntry) -> bool:
-    task = rack.target(entry)
+def _is_lost(stage: FaultStage, entry: FaultEntry) -> bool:
+    """Return True if the affected process is lost."""
+    task = stage.target(entry)
     return task is not None and task.is_lost
 
 
-def _masquerade(rack: FaultStage, entry: FaultEntry, tick: int) -> None:
+def _masquerade(stage: FaultStage, entry: FaultEntry, tick: int) -> None:
+    """Publish a forged message."""
     entry.acted(tick)
-    forge(rack.segment, rack.segment.layout.mailboxes[entry.mailbox].name, tick)
+    forge(stage.segment, stage.segment.layout.mailboxes[entry.mailbox].name, tick)
 
 
-def _stop_clock(rack: FaultStage, entry: FaultEntry, tick: int) -> None:
+def _stop_clock(stage: FaultStage, entry: FaultEntry, tick: int) -> None:
+    """Stop the clock's own process."""
     entry.acted(tick)
     os.kill(os.getpid(), signal.SIGSTOP)
 
 
-def _skip(rack: FaultStage, entry: FaultEntry, tick: int) -> None:
+def _skip(stage: FaultStage, entry: FaultEntry, tick: int) -> None:
+    """Let the clock skip ticks."""
     entry.acted(tick)
-    rack.driver.skip = int(entry.parameters[0])
-    rack.driver.count_skipped(tick, rack.driver.skip)
+    stage.driver.skip = int(entry.parameters[0])
+    stage.driver.count_skipped(tick, stage.driver.skip)
 
 
-def _delay(rack: FaultStage, entry: FaultEntry, tick: int) -> None:
+def _delay(stage: FaultStage, entry: FaultEntry, tick: int) -> None:
+    """Delay a tick by a random part of its period."""
     entry.acted(tick)
-    part = random.Random(entry.seed + tick).uniform(LEAST_LATE, entry.parameters[0])
-    until = rack.clock.time_of(tick) + int(part * rack.clock.period_ns)
-    # A tick is delayed by less than a tick period, so the grid itself stays.
-    time.sleep(max(0, until - time.monotonic_ns()) * 1e-9)
+    delay = random.Random(entry.seed + tick).uniform(LEAST_LATE, entry.parameters[0])
+    until_ns = stage.clock.time_of(tick) + int(delay * stage.clock.period_ns)
+    # The delay is less than a tick period, so the clock's grid is not shifted.
+    time.sleep(max(0, until_ns - time.monotonic_ns()) * 1e-9)
 
 
 KILL = ClockStep(_kill)
@@ -125,10 +138,11 @@ CLOCK_STOP = ClockStep(_stop_clock)
 CLOCK_SKIP = ClockStep(_skip)
 CLOCK_JITTER = ClockStep(during=_delay)
 ELSEWHERE = ClockStep()
-"""The step of a fault that acts in another process."""
+"""Empty step of a fault that acts in another process."""
 
 
 def _step(entry: FaultEntry) -> ClockStep:
+    """Return the step of a fault on the clock's board."""
     step = kind_of(entry).step
     return step if isinstance(step, ClockStep) else ELSEWHERE
 
@@ -144,16 +158,16 @@ def _next_change(entry: FaultEntry, tick: int) -> int:
 
 
 class FaultStage:
-    """Begins and ends faults at ticks, before any task of the tick is released; sees messages flow
-    again after them.
+    """Begins and ends the faults of a rack at their ticks, before any task of the tick is released.
 
-    In lockstep a process is struck between two cycles, once it has finished its release, and the
-    run continues once its end is known. So a run with faults is repeatable. In real time a fault
-    with a phase strikes within its tick, after the releases.
+    It also reports when messages flow again after a fault. In lockstep a process is killed or
+    stopped between two cycles, after it has finished its release, and the run continues once the
+    crate has recorded its end. A run with faults is therefore repeatable. In real time a fault with
+    a phase acts within its tick, after the releases.
 
     Attributes:
-        injected: Number of faults that have come.
-        next_tick: Until then there is nothing to do, unless more faults come.
+        injected: Number of faults injected so far.
+        next_tick: Next tick at which a fault may begin, act or end, if no more faults are injected.
     """
 
     def __init__(self, segment: Segment, driver: ClockDriver) -> None:
@@ -168,24 +182,34 @@ class FaultStage:
         self.injected = 0
         self.next_tick = 0
         self._awaited: dict[int, int] = {}
-        """By mailbox, as an index, the tick from which a message must be."""
+        """By index of a mailbox, the tick from which a new message is awaited."""
         if self._words[System.STATE] == Run.RUNNING:
-            # A restarted clock does not know what its predecessor has seen.
+            # A restarted clock does not know which messages have been seen before.
             for entry in self._table.staged((Stage.OVER,)):
                 self._await_messages(entry)
         self._phased: list[FaultEntry] = []
 
     def target(self, entry: FaultEntry) -> ReleasedTask | None:
-        """Return the task, or host board, that a fault strikes; None: the clock."""
+        """Return the task or host board that a fault affects. None if it affects the clock."""
         return next((task for task in self.driver.processes if task.index == entry.task), None)
 
     def send(
         self, entry: FaultEntry, tick: int, task: ReleasedTask, number: signal.Signals
     ) -> bool:
-        """Send a signal to a task's process; return False if there is no such process."""
+        """Send a signal to a task's process and record that the fault acted.
+
+        Args:
+            entry: The fault.
+            tick: Current tick.
+            task: Task whose process gets the signal.
+            number: The signal.
+
+        Returns:
+            False if the process does not exist.
+        """
         pid = task.block[Block.PID]
-        # A host board whose program is done, or given up, or which a replay does without, has no
-        # process; the crate may not have seen yet that one has ended.
+        # A host board has no process if its program has finished or was given up, or in a replay.
+        # A process may also have ended without the crate having noticed.
         if task.is_lost or task.block[Block.STATE] > TaskState.RUNNING or pid <= 0:
             return False
         entry.acted(tick)
@@ -196,7 +220,7 @@ class FaultStage:
         return True
 
     def advance(self, tick: int) -> None:
-        """Begin the faults due at `tick`, and end those that are over."""
+        """Begin the faults that are due at `tick` and end the ones that are over."""
         self.injected = self._words[System.INJECTED]
         faults = self._table.staged(OPEN)
         active = [entry for entry in faults if entry.stage == Stage.ACTIVE]
@@ -204,11 +228,11 @@ class FaultStage:
         over = [entry for entry in active if self._is_over(entry, tick)]
         due = [entry for entry in waiting if self._is_due(entry, tick)]
         if over or due:
-            # A running cycle finishes with the faults with which it began.
+            # Let running cycles finish with the faults with which they began.
             self.driver.settle()
         for entry in over:
             entry.stage = Stage.OVER
-            # Some end early: they strike once, or have lost their object.
+            # Faults that act once, or whose process is gone, end early.
             entry.until = min(entry.until, tick)
             self._words[System.FAULTS] += 1
             _step(entry).end(self, entry, tick)
@@ -220,40 +244,38 @@ class FaultStage:
         for entry in active:
             _step(entry).during(self, entry, tick)
         self.driver.is_flooded = any(kind_of(entry).step is Babble for entry in active)
-        for box, since in list(self._awaited.items()):
+        for box, since_tick in list(self._awaited.items()):
             observer = self._observer(box)
-            if observer.read(tick - 1).is_there and observer.newest >= since:
+            if observer.read(tick - 1).is_there and observer.newest >= since_tick:
                 del self._awaited[box]
-                self.driver.alarms.ring(tick, Alarm.FLOWS, box, tick - since, since)
-        # While rings are flooded, ticks must come one at a time: the recorder keeps up with each.
+                self.driver.alarms.ring(tick, Alarm.FLOWS, box, tick - since_tick, since_tick)
+        # While messages flood the rings, do one tick at a time, so that the recorder keeps up.
         must_look = self._awaited or self.driver.is_flooded
         changes = [tick + 1] if must_look else [_next_change(entry, tick) for entry in faults]
         self.next_tick = min(changes, default=NEVER)
 
     def within(self, tick: int) -> None:
-        """Let the faults with a phase in `tick` strike at their times; call it after the
-        releases.
-        """
+        """Carry out the faults that have a phase in `tick`. Call it after the releases."""
         if not self._phased:
             return
         clock = self.clock
         for entry in sorted(self._phased, key=lambda e: e.phase):
-            at = clock.time_of(tick) + entry.phase * clock.period_ns // PHASES
-            time.sleep(max(0, at - time.monotonic_ns()) * 1e-9)
+            at_ns = clock.time_of(tick) + entry.phase * clock.period_ns // PHASES
+            time.sleep(max(0, at_ns - time.monotonic_ns()) * 1e-9)
             _step(entry).begin(self, entry, tick)
         self._phased.clear()
 
     def _is_over(self, entry: FaultEntry, tick: int) -> bool:
+        """Return True if a fault has reached its end, has acted once, or has lost its process."""
         kind = kind_of(entry)
         has_acted = kind.once and kind.is_of_task and entry.count > 0
         return entry.until <= tick or has_acted or _step(entry).is_void(self, entry)
 
     def _is_due(self, entry: FaultEntry, tick: int) -> bool:
-        """Say whether a fault begins. Its condition is read in every tick, so that no message is
-        missed.
+        """Return True if a fault must begin at this tick.
 
-        It is read as of the tick before: the clock works ahead of the grid, where messages of
-        `tick` may be missing.
+        A condition is read at every tick, so that no message is missed. It is read as of the
+        previous tick: the clock works ahead of the grid, so messages of `tick` may not exist yet.
         """
         if entry.when_box < 0:
             return entry.tick <= tick
@@ -263,13 +285,15 @@ class FaultStage:
         return reading.is_there and int(getattr(reading.message, field)) == entry.when_value
 
     def _begin(self, entry: FaultEntry, tick: int) -> None:
+        """Activate a fault and carry it out, or schedule it within the tick if it has a phase."""
         kind = kind_of(entry)
         entry.tick = tick
-        lasts = entry.ticks
+        duration_ticks = entry.ticks
         if kind.once and not kind.is_of_task:
-            # Such a fault of a task stays active until the task's next cycle.
-            lasts = 1
-        entry.until = tick + lasts if lasts else NEVER
+            # The board has carried it out at once. A fault of a task would stay active until the
+            # task's next cycle.
+            duration_ticks = 1
+        entry.until = tick + duration_ticks if duration_ticks else NEVER
         entry.stage = Stage.ACTIVE
         self._words[System.FAULTS] += 1
         self.driver.alarms.ring(tick, Alarm.FAULT_BEGINS, entry.index)
@@ -279,6 +303,7 @@ class FaultStage:
             _step(entry).begin(self, entry, tick)
 
     def _await_messages(self, entry: FaultEntry) -> None:
+        """Start to watch for the first new message in each mailbox that a fault has affected."""
         layout = self.segment.layout
         if kind_of(entry).takes_mailbox:
             for box in struck_mailboxes(layout, entry.mailbox, board_of(entry, layout)):

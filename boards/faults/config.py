@@ -1,4 +1,4 @@
-"""`[[fault]]` tables: a fault as a user writes it, and the condition that starts it."""
+"""`[[fault]]` tables: faults as users write them, and the conditions that start them."""
 
 from __future__ import annotations
 
@@ -19,17 +19,21 @@ _UNIT_S = {"ms": 1e-3, "s": 1.0, "min": 60.0}
 
 
 def as_seconds(value: Any) -> Any:
-    """Return a duration in s. Raises `ValueError`."""
+    """Convert a duration such as "20ms" to seconds. Values other than text are returned unchanged.
+
+    Raises:
+        ValueError: The text is not a duration.
+    """
     if not isinstance(value, str):
         return value
-    found = _DURATION.fullmatch(value)
-    if found is None:
+    match = _DURATION.fullmatch(value)
+    if match is None:
         raise ValueError('should be a time, as in "0.5s", "20ms" or 0.5')
-    return float(found[1]) * _UNIT_S[found[2]]
+    return float(match[1]) * _UNIT_S[match[2]]
 
 
 def _number(value: Any) -> Any:
-    """Return a boolean as 0 or 1: all parameters are numbers, so `random = true` means 1."""
+    """Convert a boolean to 0 or 1, because all parameters are numbers: `random = true` means 1."""
     return float(value) if isinstance(value, bool) else value
 
 
@@ -38,7 +42,7 @@ Seconds = Annotated[float, BeforeValidator(as_seconds), Field(gt=0, le=1e6, allo
 
 
 class FaultConfig(Table):
-    """`[[fault]]`: one fault. Any other key is a numeric parameter of its kind."""
+    """`[[fault]]`: one fault. Keys that are not listed here are numeric parameters of its kind."""
 
     model_config = ConfigDict(extra="allow", frozen=True)
     __pydantic_extra__: dict[str, Parameter]
@@ -46,7 +50,7 @@ class FaultConfig(Table):
     kind: str
     """kind of fault; 'rack inject --help' lists the kinds"""
     board: str
-    """task to strike: a board (servo), its planner (servo.planner), or clock"""
+    """affected task: a board (servo), its planner (servo.planner), or clock"""
     tick: Tick | None = None
     """first tick; give at most one of tick, at, when; default: the first of the run"""
     at: Moment | None = None
@@ -58,7 +62,7 @@ class FaultConfig(Table):
     cycles: int | None = Field(None, ge=1, le=10**6)
     """instead of for: duration in cycles of the task"""
     phase: float = Field(0.0, ge=0, lt=1)
-    """fraction of the first tick that passes before it strikes; real time only"""
+    """fraction of the first tick that passes before it acts; real time only"""
     mailbox: str | None = None
     """mailbox to affect; default: all that the task writes; for masquerade, the first"""
     seed: int | None = Field(None, ge=0, le=2**31 - 1)
@@ -66,48 +70,54 @@ class FaultConfig(Table):
 
     @property
     def parameters(self) -> dict[str, float]:
-        """The given parameters by name, not yet checked against the kind."""
+        """Values of the parameters by name, not yet checked against the kind."""
         return dict(self.__pydantic_extra__ or {})
 
 
 def condition(text: str, layout: Layout) -> tuple[int, int, int]:
-    """Return a condition as indices of mailbox and field, and a number. Raises `LookupError` with a
-    reason.
+    """Parse a condition such as "elemental_move.status.verb == grasp".
+
+    Returns:
+        Index of the mailbox, index of the field in it, and the number to compare with.
+
+    Raises:
+        LookupError: The condition is malformed, or names a mailbox, field or value that does not
+            exist.
     """
-    found = CONDITION.fullmatch(text)
-    if found is None:
+    match = CONDITION.fullmatch(text)
+    if match is None:
         raise LookupError(
             'must be mailbox.field == value, as in "elemental_move.status.verb == grasp"'
         )
-    mailboxes = {mailbox.name: at for at, mailbox in enumerate(layout.mailboxes)}
-    if found[1] not in mailboxes:
-        raise LookupError(f"no mailbox '{found[1]}'; mailboxes: {', '.join(mailboxes)}")
-    mailbox = layout.mailboxes[mailboxes[found[1]]]
+    mailboxes = {mailbox.name: index for index, mailbox in enumerate(layout.mailboxes)}
+    if match[1] not in mailboxes:
+        raise LookupError(f"no mailbox '{match[1]}'; mailboxes: {', '.join(mailboxes)}")
+    mailbox = layout.mailboxes[mailboxes[match[1]]]
     fields = {
         f.name: f
         for f in mailbox.fields
         if not f.fields and not f.shape and np.dtype(f.kind).kind in "iu"
     }
-    if found[2] not in fields:
+    if match[2] not in fields:
         raise LookupError(
-            f"'{mailbox.name}' has no integer field '{found[2]}'; integer fields:"
+            f"'{mailbox.name}' has no integer field '{match[2]}'; integer fields:"
             f" {', '.join(fields) or 'none'}"
         )
-    field = fields[found[2]]
-    value = dict(field.values).get(found[3].lower())
+    field = fields[match[2]]
+    value = dict(field.values).get(match[3].lower())
     if value is None:
-        permitted = np.iinfo(field.kind)
+        limits = np.iinfo(field.kind)
         with suppress(ValueError):
-            value = int(found[3])
-        if value is None or not permitted.min <= value <= permitted.max:
+            value = int(match[3])
+        if value is None or not limits.min <= value <= limits.max:
             names = ", ".join(dict(field.values))
-            known = names or f"a number from {permitted.min} to {permitted.max}"
-            raise LookupError(f"'{found[3]}' is not a value of '{field.name}'; permitted: {known}")
+            valid = names or f"a number from {limits.min} to {limits.max}"
+            raise LookupError(f"'{match[3]}' is not a value of '{field.name}'; valid: {valid}")
     return mailboxes[mailbox.name], mailbox.fields.index(field), value
 
 
 def condition_text(when: tuple[int, int, int], layout: Layout) -> str:
-    """Return a condition as a user writes it: the inverse of `condition`."""
+    """Return a condition as a user writes it. This is the inverse of `parse_condition`."""
     mailbox = pick(layout.mailboxes, when[0], "mailbox")
     field = pick(mailbox.fields, when[1], "field")
     names = {number: name for name, number in field.values}

@@ -1,7 +1,7 @@
-"""Random faults: duration and strength, drawn so that the fault is detectable.
+"""Distributions of the duration and the strength of random faults that can be detected.
 
-A kind's record holds draws made by the functions here; a campaign calls them. The same generator
-draws the same fault.
+The functions here return draws, which the records of the kinds contain and which campaigns call.
+Generators in equal states draw equal faults.
 """
 
 from __future__ import annotations
@@ -12,14 +12,19 @@ from dataclasses import dataclass
 from random import Random
 
 BEYOND = 20.0
-"""Sizes are drawn up to this multiple of the smallest size that must be detected."""
+"""Ratio of the largest size drawn to the smallest size that must be detected."""
 
 
 @dataclass(frozen=True)
 class Drawing:
-    """The basis of a draw: the generator, ticks per simulated second, and the number of joints.
+    """Input of a draw.
 
-    `cycle` is that of the affected task, `reader` that of its mailbox's fastest reader, ticks.
+    Attributes:
+        rng: Random generator.
+        cycle: Cycle of the affected task, ticks.
+        reader: Cycle of the fastest reader of its mailbox, ticks.
+        second: Number of ticks in a simulated second.
+        joints: Number of joints.
     """
 
     rng: Random
@@ -34,61 +39,74 @@ DrawTicks = Callable[[Drawing], int]
 
 
 def number(least: float, most: float) -> Draw:
-    """Draw a number, uniformly."""
+    """Return a draw that is uniform between two numbers."""
     return lambda d: _short(d.rng.uniform(least, most))
 
 
 def whole(least: int, most: int) -> Draw:
-    """Draw a whole number, uniformly."""
+    """Return a draw that is uniform among the integers between two numbers, both included."""
     return lambda d: d.rng.randint(least, most)
 
 
 def magnitude(least: float, most: float) -> Draw:
-    """Draw a number, log-uniformly."""
+    """Return a draw that is log-uniform between two numbers."""
     return lambda d: _short(math.exp(d.rng.uniform(math.log(least), math.log(most))))
 
 
 def joint(d: Drawing) -> int:
-    """Draw a joint; in one case of ten -1, all joints."""
+    """Draw the index of a joint. In one of ten cases it is -1, which means all joints."""
     return d.rng.randrange(d.joints) if d.rng.random() < 0.9 else -1
 
 
 def joint_or_all(d: Drawing) -> int:
-    """Draw a joint or, in half of all cases, -1: all joints."""
+    """Draw the index of a joint. In half of all cases it is -1, which means all joints."""
     return d.rng.choice((-1, d.rng.randrange(d.joints)))
 
 
 def seconds(least: float, most: float) -> DrawTicks:
-    """Draw a duration in simulated seconds, ticks."""
+    """Return a draw of a duration that is uniform between two simulated times in s."""
     return lambda d: max(1, round(d.rng.uniform(least, most) * d.second))
 
 
 def cycles(least: int, most: int) -> DrawTicks:
-    """Draw a duration in cycles of the task, ticks."""
+    """Return a draw of a duration that is uniform between two numbers of the task's cycles."""
     return lambda d: d.rng.randint(least, most) * d.cycle
 
 
 def messages(least: int, most: int) -> DrawTicks:
-    """Draw a duration in messages, ticks; at least two reads of the fastest reader."""
+    """Return a draw of a duration that lasts for a number of messages.
+
+    It is at least two cycles of the fastest reader, so that the reader sees the fault.
+    """
     return lambda d: max(d.rng.randint(least, most) * d.cycle, 2 * d.reader)
 
 
 def longest(*lengths: DrawTicks) -> DrawTicks:
-    """Draw several durations and take the longest."""
+    """Return a draw that takes the longest of several durations."""
     return lambda d: max(draw(d) for draw in lengths)
 
 
 def silence(least: float, most: float) -> DrawTicks:
-    """Draw a multiple of the time within which the fastest reader must notice a silent mailbox."""
+    """Return a draw of a duration without messages.
+
+    It is a multiple of the time within which the fastest reader must notice a silent mailbox.
+    """
     return lambda d: round((2 * d.cycle + d.reader) * d.rng.uniform(least, most))
 
 
 def swept(least: float, visible: float, count: int) -> list[float]:
-    """Return `count` sizes for a curve of size against delay: a geometric series from `least`."""
+    """Return the sizes at which detection delay is measured, a geometric series.
+
+    Args:
+        least: Smallest size.
+        visible: Smallest size that must be detected. The series ends at `MAX_SIZE_RATIO` times this
+            size.
+        count: Number of sizes.
+    """
     ratio = BEYOND * visible / least
-    return [_short(least * ratio ** (place / max(1, count - 1))) for place in range(count)]
+    return [_short(least * ratio ** (index / max(1, count - 1))) for index in range(count)]
 
 
 def _short(value: float) -> float:
-    """Return a value rounded as files show it, so that a plan read back is the same plan."""
+    """Round a value as files show it, so that a plan that is read back is the same plan."""
     return float(f"{value:.4g}")

@@ -1,13 +1,12 @@
-"""A kind of fault is one record, `Kind`: help, checks, injection, judgement and campaigns use
-nothing else.
+"""The record that describes a fault kind.
 
-The project's own kinds are in `rack.boards.faults.kinds`. A level's author adds one next to the
-level:
+Help, checks, injection, judgement and campaigns use only this record. The project's own kinds are
+in `rack.boards.faults.kinds`. The author of a level adds a kind next to the level:
 
     KINDS.add(Kind(name="gauge-stuck", where="writer", ...))
 
 Every process of a rack imports the modules of its levels, so all of them know the kind. Programs
-that look at the rack know it as the rack publishes it: see `rack.boards.config.published`.
+that observe the rack read the kinds that it publishes: see `rack.boards.config.published`.
 """
 
 from __future__ import annotations
@@ -27,23 +26,35 @@ from rack.boards.faults.bounds import NOT_ARMED, Bound, BoundCase, cycle_ticks, 
 from rack.boards.faults.drawing import Draw, DrawTicks
 
 Where = Literal["process", "load", "core", "writer", "bus", "lock", "clock", "arm", "start"]
-"""The place where a step acts. `process`, `clock`, `bus`: the clock's board, at the start of a
-tick. `load`, `writer`, `lock`: the task itself. `core`: another process on the task's core. `arm`:
-the level that drives the arm. `start`: the board, as it starts."""
+"""Place where a step acts.
+
+- `process`, `clock`, `bus`: in the clock's board, at the start of a tick.
+- `load`, `writer`, `lock`: in the task itself.
+- `core`: in a separate process on the task's core.
+- `arm`: in the level that drives the arm.
+- `start`: in the board as it starts.
+"""
 Struck = Literal["executor", "planner", "clock", "host"]
 Died = Literal["died"]
 DIED: Died = "died"
-"""Detection by the Rack: the process died."""
+"""Detection of a process's death by the Rack."""
 RECOVERY_S = 0.25
-"""Default time after a fault within which reactions are undone, s of simulated time."""
+"""Default time after a fault within which reactions must be undone, s of simulated time."""
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """A numeric parameter of a kind: unit, range and meaning. `default` None: it must be given.
+    """A numeric parameter of a kind.
 
-    Its name must not be a key of every fault: see `rack.boards.faults.config.FaultConfig`. A
-    campaign draws its value with `drawn`; None: it keeps the default.
+    Attributes:
+        name: Name. It must differ from the keys of `rack.boards.faults.config.FaultConfig`.
+        unit: Unit, or "1".
+        meaning: Meaning, for help texts.
+        default: Default value. None if the parameter is required.
+        least: Smallest valid value.
+        most: Largest valid value.
+        is_whole: Whether the value must be an integer.
+        drawn: Draws the value in a campaign. None keeps the default.
     """
 
     name: str
@@ -56,20 +67,22 @@ class Parameter:
     drawn: Draw | None = None
 
     def __str__(self) -> str:
-        """Return its meaning, with its unit."""
+        """Return the meaning with the unit."""
         return self.meaning if self.unit == "1" else f"{self.meaning}, {self.unit}"
 
 
 @dataclass(frozen=True)
 class Consequence:
-    """The effects of a kind besides its detection. Any alarm that these do not explain is a false
-    alarm.
+    """Effects of a kind besides its detection. Any alarm that they do not explain is a false alarm.
 
-    `own`: further alarms about the fault's task, mailboxes or joint. `arm`: alarms about any joint.
-    `reactions`: codes of events that must all follow. `recovery_s`: simulated time from the end of
-    the fault, or its detection, within which every reaction is undone. `ends_process`: the task's
-    process ends; recovery includes its restart. `latches`: the task may end with an error instead
-    of recovering.
+    Attributes:
+        own: Further alarms about the fault's task, mailboxes or joint.
+        arm: Alarms about any joint.
+        reactions: Codes of events that must all follow.
+        recovery_s: Simulated time within which every reaction is undone, s, counted from the end of
+            the fault or from its detection.
+        ends_process: Whether the task's process ends, so that recovery includes its restart.
+        latches: Whether the task may end with an error instead of recovering.
     """
 
     own: tuple[Alarm, ...] = ()
@@ -84,16 +97,24 @@ class Consequence:
 class Kind:
     """One kind of fault.
 
-    `step` does the damage. Its type depends on `where`: a `ClockStep`, a subclass of `MessageStep`,
-    a `LoadStep`, a function run by a separate process (`core`), a step of `rack.levels.fault_steps`
-    (`arm`); `start` needs none. `tasks` lists the roles that can be struck. `detected_as`: alarms,
-    or "died", that count as its detection, within `bound`. `lasts` draws its duration in a
-    campaign, ticks.
-
-    `realtime`: impossible in lockstep, where time waits for every task. `once`: it strikes once;
-    other kinds last for a time or until the run ends. `within_tick`: it can strike within a tick;
-    other kinds begin with a cycle. `visible_from`: the smallest value of its parameter `size` that
-    must be detected. `not_queued`: why it does not strike queues; empty if it does.
+    Attributes:
+        name: Name of the kind.
+        where: Where the step acts.
+        means: What happens, for help texts.
+        detected_as: Alarms, or "died", that count as detection.
+        bound: Time within which the fault must be detected.
+        step: Carries out the fault. Its type depends on `where`: a `ClockStep`, a subclass of
+            `MessageStep`, a `LoadStep`, a function that a separate process runs (`core`), or a step
+            of `rack.levels.fault_steps` (`arm`). None for `start`.
+        parameters: Parameters of the kind.
+        tasks: Roles that can be affected.
+        consequence: Effects besides detection.
+        lasts: Draws the duration in a campaign, ticks.
+        realtime: Whether the fault is impossible in lockstep, where time waits for every task.
+        once: Whether it acts only once. Other faults last for a time or until the run ends.
+        within_tick: Whether it can act within a tick. Other faults begin with a cycle.
+        visible_from: Smallest value of the parameter `size` that must be detected.
+        not_queued: Why the kind does not affect queues. Empty if it does.
     """
 
     name: str
@@ -114,14 +135,12 @@ class Kind:
 
     @property
     def number(self) -> int:
-        """Number of the kind in the fault table, derived from its name so that all processes
-        agree.
-        """
+        """Number of the kind in the fault table, derived from its name in every process."""
         return crc32(self.name.encode())
 
     @property
     def takes_mailbox(self) -> bool:
-        """Whether it affects messages: of one mailbox, or of all that the task writes."""
+        """Whether it affects messages, of one mailbox or of all that the task writes."""
         return self.where in ("writer", "bus", "lock")
 
     @property
@@ -136,47 +155,60 @@ class Kind:
 
     @property
     def recoverable(self) -> bool:
-        """Whether the task continues after it."""
+        """Whether the task continues after the fault."""
         return self.where != "start"
 
     @cached_property
     def codes(self) -> tuple[str, ...]:
-        """The codes of events that count as its detection."""
+        """Codes of the events that count as detection."""
         return tuple(
-            found if isinstance(found, str) else found.name.lower() for found in self.detected_as
+            cause if isinstance(cause, str) else cause.name.lower() for cause in self.detected_as
         )
 
     @property
     def size(self) -> Parameter | None:
-        """The parameter that decides whether the fault is detectable; None if it always is."""
+        """Parameter that determines whether the fault is detectable. None if it always is."""
         if self.visible_from is None:
             return None
         return next(p for p in self.parameters if p.name == "size")
 
     def values(self, fault: FaultEntry | Injection) -> dict[str, float]:
-        """Return the parameters that a fault of this kind holds, by name."""
+        """Return the parameters of a fault of this kind, by name."""
         return {p.name: value for p, value in zip(self.parameters, fault.parameters, strict=False)}
 
     def bound_ticks(
         self, injection: Injection, layout: Layout, reader: str | None = None
     ) -> int | None:
-        """Return the bound from the tick at which a fault first shows to its detection, ticks;
-        None: no bound.
+        """Compute the detection bound of a fault.
 
-        `reader` is the task that detects it; None: the first to do so, for a death the Rack. A
-        mailbox without readers has no bound.
+        Args:
+            injection: The fault.
+            layout: Layout of the rack.
+            reader: Task that detects the fault. None stands for whichever task is first or, for a
+                death, for the Rack.
+
+        Returns:
+            Ticks from the fault's first effect to its detection. None if there is no bound, as for
+            a mailbox that nobody reads.
         """
         case = BoundCase(layout, injection, self.values(injection), reader)
         needs_reader = self.takes_mailbox or (self.detected_as == (DIED,) and reader is not None)
         return None if needs_reader and not case.mailboxes else self.bound.ticks(case)
 
     def recovery_ticks(self, board: str, layout: Layout, restart_s: float) -> int:
-        """Return the time from the end of a fault, or its detection, within which all is well
-        again, ticks.
+        """Compute the time within which the rack must have recovered.
 
-        `restart_s`: simulated time that a restart may take. A restarted board rejoins at its next
-        release; the executor of a restarted planner continues with its first plan. Messages flow
-        again with the next one of each mailbox.
+        A restarted board continues at its next release; the executor of a restarted planner
+        continues with the planner's first plan. Messages flow again with the next one of each
+        mailbox.
+
+        Args:
+            board: Name of the affected task.
+            layout: Layout of the rack.
+            restart_s: Simulated time that a restart may take, s.
+
+        Returns:
+            Ticks from the end of the fault, or from its detection.
         """
         ends = self.consequence.ends_process
         cycle = cycle_ticks(layout, board) if ends and board != CLOCK else 0
@@ -195,30 +227,33 @@ UNKNOWN = Kind(
 
 
 class Kinds:
-    """The kinds known to this process, in the order of their addition."""
+    """The kinds that this process knows, in the order in which they were added."""
 
     def __init__(self) -> None:
         self._by_name: dict[str, Kind] = {}
         self._by_number: dict[int, Kind] = {}
 
     def add(self, *kinds: Kind) -> None:
-        """Add kinds. Raises `ValueError` for a name or number in use, or for too many
-        parameters.
+        """Add kinds.
+
+        Raises:
+            ValueError: A name or number is in use, or a kind has too many parameters.
         """
         for kind in kinds:
             if kind.number in self._by_number:
                 raise ValueError(
-                    f"kind '{kind.name}': already taken by '{self._by_number[kind.number].name}'"
+                    f"kind '{kind.name}' has the number of '{self._by_number[kind.number].name}';"
+                    " rename it"
                 )
             if len(kind.parameters) > PARAMETERS:
                 raise ValueError(
-                    f"kind '{kind.name}': {len(kind.parameters)} parameters; permitted:"
-                    f" {PARAMETERS}"
+                    f"kind '{kind.name}' has {len(kind.parameters)} parameters;"
+                    f" at most {PARAMETERS} are allowed"
                 )
             self._by_name[kind.name] = self._by_number[kind.number] = kind
 
     def adopt(self, kinds: Iterable[Kind]) -> None:
-        """Add the kinds that a rack has published and this process does not know."""
+        """Add the kinds that a rack has published and that this process does not know."""
         self.add(*(kind for kind in kinds if kind.number not in self._by_number))
 
     def __iter__(self) -> Iterator[Kind]:
@@ -231,8 +266,13 @@ class Kinds:
         return name in self._by_name
 
     def __getitem__(self, key: str | int) -> Kind:
-        """Return the kind of a name, or of a number in the fault table. Raises `KeyError` for an
-        unknown name.
+        """Return the kind with a name, or with a number in the fault table.
+
+        An unknown number gives `UNKNOWN`, because a rack may have kinds that this process cannot
+        import.
+
+        Raises:
+            KeyError: The name is unknown.
         """
         return self._by_name[key] if isinstance(key, str) else self._by_number.get(key, UNKNOWN)
 
@@ -246,5 +286,5 @@ KINDS = Kinds()
 
 
 def kind_of(entry: FaultEntry) -> Kind:
-    """Return the kind of a fault in the fault table."""
+    """Return the kind of an entry of the fault table."""
     return KINDS[entry.kind]

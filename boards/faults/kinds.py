@@ -1,6 +1,4 @@
-"""The project's own kinds of faults, one record each, in the order in which `rack inject --list`
-shows them.
-"""
+"""The fault kinds of this project, in the order in which `rack inject --list` shows them."""
 
 from __future__ import annotations
 
@@ -24,7 +22,7 @@ SENSOR = Consequence(
     latches=True,
 )
 # A failed motor is retried every 0.5 s: the brakes are released, and engage again within 12 cycles
-# if it still fails. An alarm about any other motor is a false one.
+# if it still fails. An alarm about any other motor is a false alarm.
 MOTOR = Consequence(reactions=BRAKED, recovery_s=0.6, latches=True)
 COMMAND = Consequence(reactions=BRAKED)
 # Any word of the message's head may be damaged: its serial, its ticks, its writer.
@@ -34,24 +32,26 @@ NOISE_RAD = 0.005
 """Sensor errors of at least this size must be detected."""
 
 
-# Kinds that act in the same place, with the same consequences.
+# Constructors of kinds that act in the same place and have the same consequences.
 _clock = partial(Kind, where="clock", tasks=("clock",))
 _message = partial(Kind, where="writer")
 _sensor = partial(Kind, where="arm", consequence=SENSOR)
 _motor = partial(Kind, where="arm", consequence=MOTOR)
-# The limit gate finds a bad torque in the same cycle: it never reaches the arm.
+# The limit gate finds a bad torque in the same cycle, before it reaches the arm.
 _torque = partial(
     Kind, where="arm", consequence=COMMAND, bound=bounds.cycles(0), lasts=draw.seconds(0.01, 0.2)
 )
 
 
 def _joint(drawn: draw.Draw = draw.joint, default: float = 0) -> Parameter:
+    """Return the parameter that selects a joint."""
     return Parameter(
         "joint", "1", "joint, counted from 0; -1: all", default, -1, 15, is_whole=True, drawn=drawn
     )
 
 
 def _probability(default: float, most: float) -> Parameter:
+    """Return the parameter for the probability that a message is affected."""
     return Parameter(
         "probability",
         "1",
@@ -64,6 +64,7 @@ def _probability(default: float, most: float) -> Parameter:
 
 
 def _size(meaning: str, visible: float, least: float, most: float) -> Parameter:
+    """Return the parameter for the size of a sensor error. Draws start at the visible size."""
     return Parameter(
         "size",
         "rad",
@@ -95,7 +96,7 @@ KINDS.add(
         step=clock_board.HANG,
         tasks=("executor", "planner", "host"),
         detected_as=(Alarm.HANG,),
-        # Four releases missed, plus the release at which that is noticed.
+        # Four missed releases, plus the release at which the reader notices them.
         bound=bounds.cycles(4 + 1),
         consequence=DEATH,
         lasts=draw.cycles(7, 10),
@@ -170,7 +171,7 @@ KINDS.add(
         step=messages.Drop,
         parameters=(_probability(0.3, 0.9),),
         detected_as=(Alarm.GAP,),
-        # The next message reveals the gap in serials.
+        # The gap in serials shows with the next message.
         bound=bounds.writes(1) + bounds.DELIVERY,
         consequence=Consequence(own=(Alarm.MUTE,)),
         lasts=draw.messages(4, 8),
@@ -203,7 +204,7 @@ KINDS.add(
         means="consecutive messages are swapped",
         step=messages.Reorder,
         parameters=(_probability(0.3, 0.9),),
-        # The last message may have no successor to be swapped with: it is only late.
+        # The last message may have no successor with which to be swapped. It is then only late.
         detected_as=(Alarm.DISORDER, Alarm.HELD_BACK),
         not_queued="the messages of one cycle have the same tick: nothing would show their order",
         bound=bounds.writes(1) + bounds.DELIVERY,
@@ -398,8 +399,7 @@ KINDS.add(
         step=arm.MotorStep(lambda fault: 0.0),
         parameters=(_joint(default=1),),
         detected_as=(Alarm.ACTUATOR,),
-        # In shorter cycles dry friction, which changes with the velocity, hides it for more of
-        # them.
+        # Dry friction hides the fault for a time, which is more cycles if cycles are shorter.
         bound=bounds.cycles_and_time(5, 12_500_000),
         lasts=draw.seconds(0.05, 0.4),
     ),
@@ -420,11 +420,12 @@ KINDS.add(
             ),
         ),
         detected_as=(Alarm.ACTUATOR,),
-        # At first this looks like an external load; it shows once the commanded torque rises and
-        # the motor's does not. Each cycle the joint loop commands 0.3 of the missing torque more
-        # (twice its bandwidth, 60 rad/s, times the cycle), of which a sound motor delivers at least
-        # 0.3. In the worst case reversing dry friction hides all of the missing torque at first: 1
-        # / (0.3 * 0.3) cycles. In shorter cycles the command rises by less in each.
+        # At first this looks like an external load. It shows once the commanded torque rises and
+        # the motor's torque does not. In each cycle the joint loop adds 0.3 of the missing torque
+        # to its command (twice its bandwidth of 60 rad/s, times the cycle); a working motor would
+        # deliver at least 0.3 of that. In the worst case, reversing dry friction hides all of the
+        # missing torque at first, which gives 1 / (0.3 * 0.3) cycles. The time is a lower limit
+        # because the command rises by less in each cycle if cycles are shorter.
         bound=bounds.cycles_and_time(12, 30_000_000),
         lasts=draw.seconds(0.05, 0.4),
     ),
@@ -438,7 +439,7 @@ KINDS.add(
             Parameter("side", "1", "0: the flexor; 1: the extensor", 0, 0, 1, is_whole=True),
         ),
         detected_as=(Alarm.TENDON,),
-        # Slack in five cycles in a row; the first sample after it tears is that of a cycle later.
+        # Five successive cycles with slack; the first sample after the tear is one cycle late.
         bound=bounds.cycles(5 + 1),
         lasts=draw.seconds(0.05, 0.4),
     ),
@@ -477,4 +478,4 @@ KINDS.add(
     ),
 )
 BUILT_IN = frozenset(KINDS.names)
-"""Names of these kinds, which every process knows."""
+"""Names of the kinds in this file, which every process knows."""

@@ -1,4 +1,4 @@
-"""Faults of one task: in its messages, its computing time, its hardware, and on its core."""
+"""Faults of one task: its messages, its computing time, its hardware and its core."""
 
 from __future__ import annotations
 
@@ -25,12 +25,19 @@ if TYPE_CHECKING:
 LEAST_S = 0.001
 """Shortest polling interval of a waiting hog."""
 LOOK_S = 0.05
-"""Longest polling interval of a waiting hog, which must notice that the run has stopped."""
+"""Longest polling interval of a waiting hog, which must notice the end of the run."""
 
 
 @dataclass(frozen=True)
 class ExtraComputing:
-    """Extra computing time in a task's cycle. `until` is the kind's step."""
+    """Extra computing time in a task's cycle.
+
+    Attributes:
+        entry: The fault.
+        spec: The affected task.
+        clock: System clock of the rack.
+        until: Step of the kind, which computes when the extra computing ends.
+    """
 
     entry: FaultEntry
     spec: TaskSpec
@@ -38,11 +45,11 @@ class ExtraComputing:
     until: LoadStep
 
     def burn(self, tick: int) -> None:
-        """Compute until the time that the step returns."""
-        now = monotonic_ns()
+        """Keep the processor busy until the time that the step computes."""
+        now_ns = monotonic_ns()
         self.entry.acted(tick)
-        end = self.until(self, tick, now)
-        while monotonic_ns() < end:
+        end_ns = self.until(self, tick, now_ns)
+        while monotonic_ns() < end_ns:
             pass
 
     def cycles_ns(self, cycles: float) -> int:
@@ -51,26 +58,54 @@ class ExtraComputing:
 
 
 LoadStep = Callable[[ExtraComputing, int, int], int]
-"""From the tick and the present time, the time at which computing ends; times are CLOCK_MONOTONIC,
-ns."""
+"""Computes the time at which extra computing ends from the load, the tick and the current time.
+
+Times are CLOCK_MONOTONIC in ns.
+"""
 
 
 def overrun(load: ExtraComputing, tick: int, now: int) -> int:
-    """Make an executor take `by` cycles longer, or a random part of that."""
+    """Extend an executor's cycle by `by` cycles, or by a random part of that.
+
+    Args:
+        load: The extra computing; its fault has the parameters `by` and `random`.
+        tick: Release of the cycle.
+        now: Current CLOCK_MONOTONIC, ns.
+
+    Returns:
+        CLOCK_MONOTONIC at which the computing ends, ns.
+    """
     by, is_random, *_ = load.entry.parameters
-    part = random.Random(load.entry.seed + tick).random() if is_random else 1.0
-    return now + load.cycles_ns(part * by)
+    fraction = random.Random(load.entry.seed + tick).random() if is_random else 1.0
+    return now + load.cycles_ns(fraction * by)
 
 
 def slow_plan(load: ExtraComputing, tick: int, now: int) -> int:
-    """Make a planner exceed its time slice by `by` cycles."""
+    """Extend a planner's time slice by `by` cycles.
+
+    Args:
+        load: The extra computing; its fault has the parameter `by`.
+        tick: Release of the slice.
+        now: Current CLOCK_MONOTONIC, ns.
+
+    Returns:
+        CLOCK_MONOTONIC at which the computing ends, ns.
+    """
     slice_end = load.clock.time_of(tick + load.spec.slice)
     return max(now, slice_end) + load.cycles_ns(load.entry.parameters[0])
 
 
 class TaskFaults:
-    """Applies a task's active faults: those of its writes by `apply`. `loads` are those of its
-    computing time.
+    """Applies the active faults of one task.
+
+    Args:
+        segment: Segment of the rack.
+        spec: The task.
+        apply: Called with the faults of the task's messages.
+        level: Executor or planner of the task.
+
+    Attributes:
+        loads: Faults of the task's computing time.
     """
 
     def __init__(
@@ -90,27 +125,32 @@ class TaskFaults:
         self.loads: list[ExtraComputing] = []
 
     def refresh(self, tick: int) -> int:
-        """Apply the faults that are active at `tick`; return the generation of the fault table.
+        """Apply the faults that are active at `tick`.
 
-        The clock works ahead of the grid: a fault that it has begun for a later tick waits for the
-        next call. The generation is then -1.
+        Returns:
+            Generation of the fault table, so that the caller can skip this call while it is
+            unchanged. -1 if a fault will begin at a later tick, because the clock works ahead of
+            the grid; the next cycle must call this again.
         """
         generation = self._table.generation
         entries = self._table.staged((Stage.ACTIVE,))
-        found = [(kind_of(entry), entry) for entry in entries if entry.task == self._index]
-        active = [(kind, entry) for kind, entry in found if entry.tick <= tick]
+        begun = [(kind_of(entry), entry) for entry in entries if entry.task == self._index]
+        active = [(kind, entry) for kind, entry in begun if entry.tick <= tick]
         self.loads = [
             ExtraComputing(entry, self._spec, self._clock, kind.step)
             for kind, entry in active
             if kind.where == "load" and callable(kind.step)
         ]
         self._apply([entry for kind, entry in active if kind.where in ("writer", "lock")])
-        arm = [(kind, entry) for kind, entry in active if kind.where == "arm"]
-        self._arm = [entry for _, entry in arm]
+        arm_faults = [(kind, entry) for kind, entry in active if kind.where == "arm"]
+        self._arm = [entry for _, entry in arm_faults]
         if self._spec.role == "executor":
-            faults = [Fault(k.name, k.values(e), e.seed, e.tick, k.step) for k, e in arm]
+            faults = [
+                Fault(kind.name, kind.values(entry), entry.seed, entry.tick, kind.step)
+                for kind, entry in arm_faults
+            ]
             cast("Executor", self._level).inject(faults)
-        return generation if len(active) == len(found) else -1
+        return generation if len(active) == len(begun) else -1
 
     def burn(self, tick: int) -> None:
         """Spend the extra computing time of all active faults."""
@@ -118,17 +158,19 @@ class TaskFaults:
             load.burn(tick)
 
     def count(self, acted: Mapping[int, bool], tick: int) -> None:
-        """Note what the arm's faults have done in a cycle: see `Executor.acted`."""
-        for place, shows in acted.items():
-            self._arm[place].acted(tick, shows)
+        """Record which faults of the arm acted in a cycle: see `Executor.acted`."""
+        for index, shows in acted.items():
+            self._arm[index].acted(tick, shows)
 
 
 def take_core(segment: Segment, entry: FaultEntry) -> None:
-    """Wait until the clock begins the fault, then keep the board's core busy until the fault is
-    over: a hog.
+    """Keep the core of a board busy while a fault is active (a hog).
 
-    Call it in a separate process. Raises `PermissionError` where real-time priorities are refused:
-    an ordinary process cannot take a core from a board.
+    Waits until the clock begins the fault. Call it in a separate process.
+
+    Raises:
+        PermissionError: Real-time priorities are not permitted. An ordinary process cannot take a
+            core from a board.
     """
     task = segment.layout.tasks[entry.task]
     block = segment.block(task.name)
@@ -138,8 +180,8 @@ def take_core(segment: Segment, entry: FaultEntry) -> None:
     while entry.stage == Stage.WAITING and not clock.is_stopped:
         wait_ns = clock.time_of(max(entry.tick, clock.tick + 1)) - time.monotonic_ns()
         # Wake on the clock's grid, at the first tick at which the fault can begin or at the next
-        # one. If that tick has passed, or the run has not started, sleep briefly: at this priority
-        # a busy wait would starve all others.
+        # one. If that tick has passed, or the run has not started, sleep briefly, because at this
+        # priority a busy wait would starve all other processes.
         wait_s = wait_ns * 1e-9 if wait_ns > 0 else LEAST_S
         time.sleep(min(wait_s, LOOK_S))
     end = clock.time_of(entry.until)
@@ -150,8 +192,9 @@ def take_core(segment: Segment, entry: FaultEntry) -> None:
 
 
 def act_on_core(segment: Segment, index: int) -> int:
-    """Act the fault at `index` of the fault table, which takes a task's core, in a process forked
-    by the crate; return the exit status.
+    """Carry out the fault at `index` of the fault table, which takes a task's core.
+
+    Called in a process that the crate has forked. Returns the exit status.
     """
     entry = FaultTable(segment).entries[index]
     step = kind_of(entry).step

@@ -1,3 +1,4 @@
-"""The network as a bus adapter: mailboxes of a rack exported to other racks, and theirs imported
-(section 3.3).
+"""Network adapter: exports mailboxes of a rack to other racks and imports theirs.
+
+A network is treated as one more bus adapter (section 3.3 of the paper).
 """

@@ -1,11 +1,10 @@
-"""Who may do what on a rack's session, as rules for zenoh's access control. What no rule allows is
-denied.
+"""Rules for zenoh's access control on a rack's session. Anything without a rule is denied.
 
-A rule concerns what comes in (ingress) or goes out (egress), a kind of message, and keys. With TLS
-its subject is the common name of the other side's certificate; without, there is no identity, and
-rules hold for everyone: what a rack exports anybody may read then, and what it imports is known by
-its key and its seal alone. Both sides of a subscription need a rule: to declare it is a message
-too.
+A rule allows kinds of messages under certain keys in one direction: ingress or egress. With TLS,
+its subject is the common name of the other side's certificate. Without TLS there are no identities,
+so the rules apply to everyone: anybody can read the exports of a rack, and imports are protected by
+their keys and seals alone. A subscription needs a rule on both sides, because its declaration is a
+message too.
 """
 
 from __future__ import annotations
@@ -32,21 +31,25 @@ PUT = ("put",)
 TOKEN = ("liveliness_token",)
 WATCH_TOKENS = ("declare_liveliness_subscriber", "liveliness_query")
 ANYONE = "*"
-"""Subject of rules for everyone; no rack may have this name."""
+"""Subject of rules that apply to everyone. No rack can have this name."""
 
 
 Rule = tuple[str, Sequence[str], Sequence[str]]
-"""Messages of some kinds under some keys, in one direction, that are allowed."""
+"""Direction, kinds of messages and keys that are allowed."""
 
 
 def access_control(own: str, table: LanTable, is_operator: bool) -> dict[str, Any]:
-    """Return zenoh's `access_control` for rack `own`, or for an operator of that name, who sets the
-    emergency stop of other racks.
+    """Return the value of zenoh's `access_control` for a session.
+
+    Args:
+        own: Name of the rack, or of the operator.
+        table: The `[adapter.lan]` table.
+        is_operator: Whether the session belongs to an operator, who may only set emergency stops.
     """
     by_subject: dict[str, list[Rule]] = {}
     is_known = has_tls(table)
     if is_operator:
-        # It may set the emergency stop of any rack.
+        # An operator may set the emergency stop of any rack.
         by_subject[ANYONE] = [
             (IN, ("declare_queryable",), [estop_key("*", "*")]),
             (OUT, ("query",), [estop_key(own, "*")]),
@@ -59,7 +62,7 @@ def access_control(own: str, table: LanTable, is_operator: bool) -> dict[str, An
         by_subject[ANYONE] = [
             *_visible(own),
             *_shown(exported),
-            # Others may compare their clocks with this rack's: messages of unknown age are no use.
+            # Let others measure this rack's clock: they cannot use messages of unknown age.
             (OUT, SUBSCRIBE, [ping_key("*", own)]),
             (IN, PUT, [ping_key("*", own)]),
             (IN, SUBSCRIBE, [pong_key("*", "*")]),
@@ -79,18 +82,18 @@ def access_control(own: str, table: LanTable, is_operator: bool) -> dict[str, An
     return _configured(by_subject)
 
 
-def _exchange(own: str, peer: str, table: LanTable) -> list[Rule]:
-    """Return the rules for a rack with which this one exchanges mailboxes."""
+def _exchange(rack: str, peer: str, table: LanTable) -> list[Rule]:
+    """Return the rules for a rack with which this rack exchanges mailboxes."""
     imports = [
         out_key(peer, entry.mailbox) for entry in table.imports.values() if entry.rack == peer
     ]
-    exports = [out_key(own, entry.source) for entry in table.exports.values()]
-    taken = [*imports, step_key(peer), ping_key(peer, own), pong_key(peer, own)]
+    exports = [out_key(rack, entry.source) for entry in table.exports.values()]
+    taken = [*imports, step_key(peer), ping_key(peer, rack), pong_key(peer, rack)]
     return [
-        (OUT, SUBSCRIBE, [*taken, ping_key("*", own), pong_key("*", own)]),
+        (OUT, SUBSCRIBE, [*taken, ping_key("*", rack), pong_key("*", rack)]),
         (IN, PUT, taken),
         (IN, SUBSCRIBE, [ping_key("*", peer), pong_key("*", peer)]),
-        *_shown([*exports, step_key(own), ping_key(own, peer), pong_key(own, peer)]),
+        *_shown([*exports, step_key(rack), ping_key(rack, peer), pong_key(rack, peer)]),
         (OUT, WATCH_TOKENS, [ALL_ALIVE, any_alive(peer)]),
         (IN, TOKEN, [any_alive(peer)]),
     ]
@@ -101,25 +104,26 @@ def _shown(keys: Sequence[str]) -> list[Rule]:
     return [(IN, SUBSCRIBE, keys), (OUT, PUT, keys)] if keys else []
 
 
-def _visible(own: str) -> list[Rule]:
-    """Return the rules for others that may know that this rack is there."""
-    return [(IN, WATCH_TOKENS, [ALL_ALIVE, any_alive(own)]), (OUT, TOKEN, [any_alive(own)])]
+def _visible(rack: str) -> list[Rule]:
+    """Return the rules that let others see the liveliness tokens of this rack."""
+    return [(IN, WATCH_TOKENS, [ALL_ALIVE, any_alive(rack)]), (OUT, TOKEN, [any_alive(rack)])]
 
 
 def _configured(by_subject: dict[str, list[Rule]]) -> dict[str, Any]:
+    """Return the rules of each subject in the form that zenoh expects."""
     return {
         "enabled": True,
         "default_permission": "deny",
         "rules": [
             {
-                "id": f"{subject}-{at}",
+                "id": f"{subject}-{index}",
                 "permission": "allow",
                 "flows": [flow],
                 "messages": list(messages),
                 "key_exprs": list(keys),
             }
             for subject, allowed in by_subject.items()
-            for at, (flow, messages, keys) in enumerate(allowed)
+            for index, (flow, messages, keys) in enumerate(allowed)
         ],
         "subjects": [
             {"id": subject}
@@ -128,7 +132,10 @@ def _configured(by_subject: dict[str, list[Rule]]) -> dict[str, Any]:
             for subject in by_subject
         ],
         "policies": [
-            {"rules": [f"{subject}-{at}" for at in range(len(allowed))], "subjects": [subject]}
+            {
+                "rules": [f"{subject}-{index}" for index in range(len(allowed))],
+                "subjects": [subject],
+            }
             for subject, allowed in by_subject.items()
         ],
     }

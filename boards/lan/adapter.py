@@ -1,12 +1,12 @@
-"""The network adapter: a bus adapter whose other side is the network, on eclipse-zenoh.
+"""Network adapter: a bus adapter that connects the rack to a network through eclipse-zenoh.
 
-It is an ordinary board with a rate, and a priority above its neighbours'. In its cycles it sends
-what it exports, takes what has come of its imports, notes who is there, and sets the emergency stop
-for those who may; in between only the network's own threads run, which have its core and priority.
-Nothing here waits, but in lockstep, where time stands still meanwhile.
+It is an ordinary board with a rate and a higher priority than its neighbours. In each cycle it
+sends exports, receives imports, updates which racks are present, and sets the emergency stop on
+permitted requests. Between cycles only zenoh's threads run, with the core and the priority of the
+board. The adapter never waits, except in lockstep, where simulated time stands still while it does.
 
-A restarted adapter continues from its own mailboxes. The status is written before the messages that
-it counts: an adapter killed in between has lost a message, but none is passed twice.
+A restarted adapter continues from its own mailboxes. It writes the status before the messages that
+are counted in it. If it is killed in between, a message is lost, but none is delivered twice.
 
 In a replay there is no network: see `rack.boards.lan.replayed`.
 """
@@ -45,7 +45,9 @@ _LAUNCH_MASK = (1 << 62) - 1
 
 
 class LanAdapter(Adapter):
-    """Exchanges mailboxes with other racks. Its status shows every entry, a mailbox of its own each
+    """Exchanges mailboxes with other racks.
+
+    Its status has counters for every export and import. It writes one more mailbox for each other
     rack.
     """
 
@@ -65,23 +67,26 @@ class LanAdapter(Adapter):
 
     @classmethod
     def names(cls, params: Mapping[str, Any]) -> Sequence[str]:
-        """Return the other racks, and those who may set the emergency stop: alarms name them by
-        number.
+        """Return the other racks and the operators who may set the emergency stop.
+
+        Alarms refer to them by their index in this sequence.
         """
         table = _table_in(params)
         return () if table is None else tuple(dict.fromkeys([*table.racks, *table.estop_from]))
 
     @classmethod
     def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, type[Message]]) -> MadePorts:
-        """Return a port to read for each export, one to write for each import and rack, and the
-        status.
-        """
+        """Return an input for each export, an output for each import and rack, and the status."""
         table = _table_in(params)
         if table is None:
             return MadePorts(is_whole=False)
-        known = {port: entry for port, entry in table.exports.items() if entry.source in types}
-        inputs = {port: Input(types[entry.source], entry.source) for port, entry in known.items()}
-        # It rests on what is exported under the same name, if there is such a port.
+        known_exports = {
+            port: entry for port, entry in table.exports.items() if entry.source in types
+        }
+        inputs = {
+            port: Input(types[entry.source], entry.source) for port, entry in known_exports.items()
+        }
+        # The status depends on the export of the same name, if there is one.
         rests_on = inputs.get(STATUS)
         status = Output(status_of(table.exports, table.imports), rests_on=rests_on)
         outputs: dict[str, Output[Any]] = {STATUS: status}
@@ -90,19 +95,24 @@ class LanAdapter(Adapter):
                 outputs[port] = TimedOutput(entry.message_class(), entry.max_age_ms * 1e-3)
             except LookupError:
                 continue
-        is_whole = len(known) == len(table.exports) and len(outputs) == 1 + len(table.imports)
+        is_whole = len(known_exports) == len(table.exports) and len(outputs) == 1 + len(
+            table.imports
+        )
         outputs |= {peer_port(rack): Output(PeerPresence) for rack in table.racks}
         return MadePorts(inputs, outputs, is_whole)
 
     @classmethod
     def replayed(cls, params: Mapping[str, Any], layout: Layout) -> Mapping[str, bool]:
-        """Return all that it writes: imports, racks, status."""
+        """Return the ports that are written in a replay. Only imports are sent one by one."""
         imports = read_params(LanTable, params).imports
         return {port: port in imports for port in cls.made_ports(params, {}).outputs}
 
     def attach(self, segment: Segment, entries: Entries | None) -> None:
-        """Take the segment: its grid, and the mailboxes to exchange, continued where they stand; in
-        a replay, take over what the recorded run wrote.
+        """Attach to the segment and continue from the state of the mailboxes.
+
+        Args:
+            segment: Segment of the rack.
+            entries: In a replay, the recorded messages of each port. None in a live run.
         """
         words = segment.words
         board = self.context.board
@@ -112,13 +122,15 @@ class LanAdapter(Adapter):
         self._rack = segment.rack
         self._launch = launch
         self._grid = OwnGrid(segment, self.context.every)
-        # In the time of a lease and a connection the token of every rack that is still there has
-        # come.
-        seen_by = words[System.TICK] + self._grid.ticks_in((table.lease_ms + RETRY_MS[1]) * 1e6)
+        # Within a lease and one connection attempt, every rack that is still running has shown its
+        # token.
+        confirm_by_tick = words[System.TICK] + self._grid.ticks_in(
+            (table.lease_ms + RETRY_MS[1]) * 1e6
+        )
         for peer in self._peers:
-            before, _ = last_written(segment, f"{board}.{peer_port(peer.rack)}")
-            if before is not None:
-                peer.resume(before, seen_by)
+            last_presence, _ = last_written(segment, f"{board}.{peer_port(peer.rack)}")
+            if last_presence is not None:
+                peer.resume(last_presence, confirm_by_tick)
         self._imports = {
             port: Import(segment, f"{board}.{port}", entry, self._peers[entry.rack], self._grid)
             for port, entry in table.imports.items()
@@ -132,8 +144,8 @@ class LanAdapter(Adapter):
             port: Export(segment, entry, launch, self._grid)
             for port, entry in table.exports.items()
         }
-        names = self.names(self.context.params)
-        subjects = {name: names.index(name) for name in table.estop_from}
+        sender_names = self.names(self.context.params)
+        subjects = {name: sender_names.index(name) for name in table.estop_from}
         self._desk = Desk(segment, self._grid, subjects, self.findings)
         status, tick = last_written(segment, f"{board}.{STATUS}")
         if status is not None:
@@ -147,15 +159,19 @@ class LanAdapter(Adapter):
             self._barrier = Barrier(segment, board, table.racks, self._peers.lost)
 
     def open(self) -> None:
-        """Open the session, but for a replay: its threads inherit core and priority of the board.
-        Raises `LevelError`.
+        """Open the session. In a replay, do nothing.
+
+        The session's threads inherit the core and the priority of the board.
+
+        Raises:
+            LevelError: An endpoint or a credential cannot be used.
         """
         if self._replayed is not None:
             return
         self._link = link = LanLink(self._rack, self._table)
         link.sealer.resume(self._flaws)
         barrier = self._barrier
-        # A step has one seal for all that is in it.
+        # A step has one seal for everything that it contains.
         sealer = Sealer(most_bytes=self._table.most_bytes) if barrier else link.sealer
         for entry in self._imports.values():
             entry.open(barrier or link, sealer)
@@ -165,8 +181,7 @@ class LanAdapter(Adapter):
         self._desk.open(link, self._launch)
         if barrier is not None:
             barrier.open(link, self._launch)
-            # The adapter before this one may have died with its last step before that left the
-            # machine.
+            # The previous adapter may have died before its last step had left the machine.
             if barrier.done >= 0:
                 for export in self._exports.values():
                     export.recall(barrier.done, self.context.every)
@@ -174,11 +189,11 @@ class LanAdapter(Adapter):
         self._peers.watch(
             link.watch_alive() if barrier is None else barrier.changes, barrier is not None
         )
-        # Last: whoever sees it knows all subscriptions, and loses nothing.
+        # The token comes last: a rack that sees it also sees all subscriptions and loses nothing.
         link.declare_alive(self._launch, 0 if barrier is None else barrier.cycle_ns)
 
     def process(self, tick: int) -> None:
-        """Exchange what is due."""
+        """Exchange the messages that are due in this cycle."""
         if self._replayed is not None:
             self._replayed.begin(tick)
             self._look(tick)
@@ -203,14 +218,12 @@ class LanAdapter(Adapter):
         self._report(tick)
 
     def _look(self, tick: int) -> None:
-        """Note who has come, and who has gone; demand that the arm stop while a rack that had been
-        there is lost, if it is to stop then.
-        """
+        """Update which racks are present, and set or clear the stop of the arm on a lost rack."""
         arrivals = self._peers.arrivals
         self.findings += self._peers.look(tick)
         must_stop = self._table.on_peer_loss == "stop" and bool(self._peers.lost)
         if must_stop != bool(self._words[System.PEER_STOP] & 1):
-            # In lockstep other boards, and the clock, may be ahead in their ticks of this cycle.
+            # In lockstep, other boards and the clock may be ahead of `tick` within this cycle.
             since = tick + self.context.every if self._grid.is_lockstep else tick
             self._words[System.PEER_STOP] = switch(since, must_stop)
         if self._peers.arrivals != arrivals:
@@ -218,24 +231,25 @@ class LanAdapter(Adapter):
                 export.is_asked = True
 
     def _report(self, tick: int) -> None:
-        own = self.ports[STATUS]
-        self._clocks.count(own.clocks)
+        """Write the counters, the state of each rack and the reason for holding to the outputs."""
+        status = self.ports[STATUS]
+        self._clocks.count(status.clocks)
         for port, export in self._exports.items():
-            export.fill(getattr(own, f"export_{port}"))
+            export.fill(getattr(status, f"export_{port}"))
         for port, entry in self._imports.items():
-            entry.fill(getattr(own, f"import_{port}"), tick)
-        self._desk.fill(own.desk)
+            entry.fill(getattr(status, f"import_{port}"), tick)
+        self._desk.fill(status.desk)
         for peer in self._peers:
             out = self.ports[peer_port(peer.rack)]
             self._clocks.fill(out, peer.rack, tick)
             peer.fill(out, self._grid.is_lockstep)
         if self._link is not None and not self._grid.is_lockstep:
-            fill_counts(own.flaws, self._link.sealer.flaws.values())
-        own.reason = reason = self._trouble(tick)
-        own.state = State.HOLDING if reason else State.EXECUTING
+            fill_counts(status.flaws, self._link.sealer.flaws.values())
+        status.reason = reason = self._trouble(tick)
+        status.state = State.HOLDING if reason else State.EXECUTING
 
     def _trouble(self, tick: int) -> str:
-        """Return what keeps the exchange from its work; empty: nothing."""
+        """Return the reason why the exchange is incomplete, or an empty string."""
         for peer in self._peers:
             if not peer.is_there:
                 return f"rack '{peer.rack}' is {'lost' if peer.launches else 'not there yet'}"
@@ -243,11 +257,11 @@ class LanAdapter(Adapter):
                 return f"{len(peer.tokens)} racks are named '{peer.rack}'"
             if self._clocks.is_unanswered(peer, tick):
                 return f"clock of rack '{peer.rack}' is not known: it does not answer pings"
-        old = [port for port, entry in self._imports.items() if entry.is_old(tick)]
-        return f"'{self._table.imports[old[0]].source}' is older than max_age_ms" if old else ""
+        ports = [port for port, entry in self._imports.items() if entry.is_old(tick)]
+        return f"'{self._table.imports[ports[0]].source}' is older than max_age_ms" if ports else ""
 
     def close(self) -> None:
-        """Leave the network."""
+        """Leave the network. In lockstep, first tell the other racks if the run is over."""
         if self._barrier is not None:
             self._barrier.close()
         if self._link is not None:
@@ -255,7 +269,7 @@ class LanAdapter(Adapter):
 
 
 def _table_in(params: Mapping[str, Any]) -> LanTable | None:
-    """Return the table in parameters; None if they have mistakes."""
+    """Return the table in the parameters, or None if they contain mistakes."""
     try:
         return read_params(LanTable, params)
     except LevelError:

@@ -1,5 +1,6 @@
-"""The rack for which an adapter waits in lockstep, in one word of its control block: for whoever
-watches the rack.
+"""Encoding of the rack that an adapter waits for in lockstep, for tools that watch the rack.
+
+The adapter writes one word of its control block: which rack it waits for, and why.
 """
 
 from __future__ import annotations
@@ -14,13 +15,12 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import Block
 
 GIVE_UP_S = 20.0
-"""Real time after which a rack whose adapter is gone counts as lost; a restarted board is back
-sooner."""
+"""Real time after which a rack without an adapter counts as lost, s. A restart takes less time."""
 _PLACES = 8
 
 
 class Why(IntEnum):
-    """Why a rack is awaited."""
+    """Reasons for waiting for a rack."""
 
     UNSEEN = 0
     SLOWER = 1
@@ -28,31 +28,42 @@ class Why(IntEnum):
 
 
 _TEXTS = {
-    Why.UNSEEN: "it has not come yet, or does not name this rack",
+    Why.UNSEEN: "it has not connected yet, or its config does not name this rack",
     Why.SLOWER: "it is slower, or held",
-    Why.GONE: f"its adapter is gone; it counts as lost after {GIVE_UP_S:g} s",
+    Why.GONE: f"its adapter has ended; the rack counts as lost after {GIVE_UP_S:g} s",
 }
 
 
 def word_of(place: int, why: Why) -> int:
-    """Return the word for the rack at a place among `LanTable.racks`."""
+    """Encode the rack that an adapter waits for and the reason.
+
+    Args:
+        place: Index of the rack in `LanTable.racks`.
+        why: Reason for waiting.
+
+    Returns:
+        A nonzero word for `Block.AWAITS`. Zero means that the adapter does not wait.
+    """
     return 1 + place + (why << _PLACES)
 
 
 def awaited(segment: Segment) -> Iterator[tuple[str, str]]:
-    """Yield the adapter that waits for another rack, if one does, with a text that says for which
-    and why.
+    """Yield each adapter that waits for another rack, and a text with the rack and the reason.
+
+    Raises:
+        DamageError: The word names a board that is not an adapter, or a rack or reason that does
+            not exist.
     """
     for task in segment.layout.tasks:
         if word := segment.block(task.name)[Block.AWAITS]:
-            # Only here: it takes a while to import.
+            # Imported late because the import is slow and most racks have no network.
             from rack.boards.lan.config import LanTable
 
-            why, place = divmod(word - 1, 1 << _PLACES)
+            why, index = divmod(word - 1, 1 << _PLACES)
             table = load_toml(segment.config).get("adapter", {}).get(task.board)
             if table is None:
                 raise DamageError(f"'{task.board}' waits for another rack and is no adapter")
             keys = {field.alias or name for name, field in LanTable.model_fields.items()}
             racks = LanTable.model_validate({key: table[key] for key in keys & table.keys()}).racks
-            rack = pick(racks, place, "rack")
+            rack = pick(racks, index, "rack")
             yield task.board, f"waits for rack '{rack}': {_TEXTS[as_named(Why, why)]}"

@@ -1,11 +1,10 @@
-"""The clocks of other racks next to ours: the offset of their CLOCK_MONOTONIC, by round trips with
-four stamps.
+"""Offsets between the clocks of racks, measured by round trips with four time stamps.
 
-A ping is stamped when it is sent and when it arrives there, the answer when it is sent there and
-when it arrives here. However long each way took, the true offset is within half the round trip of
-the middle: NTP's bound, which asymmetric ways cannot break. The stamps of arrival must not wait for
-the adapter's cycle. They are the one thing that a callback takes, in a thread of the network's; it
-answers at once, so that an answer waits for no cycle either.
+A ping is stamped when it is sent and when it is received; its answer is stamped likewise. The true
+offset of the other CLOCK_MONOTONIC is within half the round trip of the measured one, even if the
+two directions take different times (the bound of NTP). The stamps of arrival cannot wait for the
+adapter's cycle, so a callback in a thread of zenoh takes them. It also answers pings at once, so
+that answers do not wait for a cycle either.
 """
 
 from __future__ import annotations
@@ -30,31 +29,36 @@ from rack.boards.lan.peers import NONE, PeerRack, Peers
 from rack.levels.peer import DRIFT_PPM
 
 RECENT = 32
-"""Round trips of which the best one counts."""
+"""Number of recent round trips among which the best one is used."""
 PING_NS = 500_000_000
 EAGER_NS = 20_000_000
-"""Time between two pings to a rack; the second before `EAGER` round trips have come back, to know
-it soon."""
+"""Interval between the first pings to a rack, ns.
+
+After `EAGER_ROUND_TRIPS` answers the interval is `PING_NS`.
+"""
 EAGER = 8
 UNANSWERED = 64
-"""Newest pings to a rack whose answers still count: the round trip may take more than a second."""
+"""Number of recent pings to a rack whose answers are accepted.
+
+A round trip may therefore take more than a second.
+"""
 ANSWER_NS = 5_000_000
-"""Shortest time between two answers to one rack: a flood of pings is not answered by one of
-pongs."""
+"""Shortest interval between two answers to one rack, so that a flood of pings is not answered."""
 MOST_ASKERS = 1024
-"""Racks that get answers."""
+"""Maximum number of racks that get answers."""
 UNKNOWN_NS = 1_000_000_000
-"""Time after which a clock that is not known is reported."""
+"""Time after which an unknown clock offset is reported."""
 UNREAD = 64
-"""Answers that wait for a cycle, at most; a newer one overwrites the oldest."""
+"""Maximum number of answers that wait for a cycle. A newer answer overwrites the oldest."""
 _PONG = Struct("<Q4q")
 _PING_KIND = kind_of("ping", 1, np.dtype([]))
 _PONG_KIND = kind_of("pong", 1, np.dtype([("launch", "<u8"), ("stamps", "<i8", 4)]))
 
 
 class RoundTrip(NamedTuple):
-    """A ping and its answer, ns of CLOCK_MONOTONIC: sent and arrived here, received and answered
-    there.
+    """Time stamps of a ping and its answer, ns of CLOCK_MONOTONIC.
+
+    `sent` and `arrived` are taken by this rack; `received` and `answered` by the other one.
     """
 
     sent: int
@@ -64,63 +68,79 @@ class RoundTrip(NamedTuple):
 
     @property
     def lasted_ns(self) -> int:
-        """Time under way, both ways together."""
+        """Time that the ping and the answer spent on the network, both together."""
         return (self.arrived - self.sent) - (self.answered - self.received)
 
     @property
     def offset_ns(self) -> int:
-        """The clock there less ours, if both ways took equally long."""
+        """The other clock minus ours, assuming that both directions take equally long."""
         return (self.received - self.sent + self.answered - self.arrived) // 2
 
     def uncertainty_ns(self, now_ns: int) -> int:
-        """Return the largest error of the offset at a time here."""
-        # The halves of odd numbers are rounded down, once here and once in the offset.
-        age = max(0, now_ns - self.sent)
-        return self.lasted_ns // 2 + 1 + -(-age * DRIFT_PPM // 1_000_000)
+        """Return the largest error of the offset at the time `now_ns` of our clock.
+
+        It grows with the age of the measurement, because the clocks may drift apart.
+        """
+        # The 1 covers the rounding of two divisions by 2, here and in the offset.
+        age_ns = max(0, now_ns - self.sent)
+        return self.lasted_ns // 2 + 1 + -(-age_ns * DRIFT_PPM // 1_000_000)
 
 
 class ClockOffset:
-    """The offset of another clock, from the best of the recent round trips.
+    """Offset of another clock, taken from the best of the recent round trips.
 
-    One that contradicts the estimate begins a new one: a clock has stepped, as it does while a
-    machine sleeps.
+    A round trip that contradicts the estimate discards the earlier ones: one of the clocks has
+    stepped, as clocks do while a machine sleeps.
+
+    Attributes:
+        best: Round trip with the smallest uncertainty, or None. All uncertainties grow alike, so
+            the choice does not depend on the time.
+        steps: How often a clock was found to have stepped.
     """
 
     def __init__(self) -> None:
         self._recent: deque[RoundTrip] = deque(maxlen=RECENT)
         self.best: RoundTrip | None = None
-        """The round trip with the smallest uncertainty: at one time as at any other, as all grow
-        alike."""
         self.steps = 0
 
     def __len__(self) -> int:
         return len(self._recent)
 
     def add(self, trip: RoundTrip) -> bool:
-        """Take a round trip; False if it cannot be one: it would have taken less than no time."""
+        """Add a round trip. Return False if its stamps are impossible."""
         if trip.lasted_ns < 0 or trip.arrived < trip.sent or trip.answered < trip.received:
             return False
-        now = trip.arrived
+        now_ns = trip.arrived
         best = self.best
         if best is not None:
-            apart = abs(trip.offset_ns - best.offset_ns)
-            if apart > trip.uncertainty_ns(now) + best.uncertainty_ns(now):
+            difference_ns = abs(trip.offset_ns - best.offset_ns)
+            if difference_ns > trip.uncertainty_ns(now_ns) + best.uncertainty_ns(now_ns):
                 self._recent.clear()
                 self.steps += 1
         self._recent.append(trip)
-        self.best = min(self._recent, key=lambda found: found.uncertainty_ns(now))
+        self.best = min(self._recent, key=lambda recent: recent.uncertainty_ns(now_ns))
         return True
 
     def forget(self) -> None:
-        """Begin anew."""
+        """Discard all round trips."""
         self._recent.clear()
         self.best = None
 
 
 @dataclass
 class PeerClock:
-    """The clock of one rack, and its grid: CLOCK_MONOTONIC of its tick 0, 0 before that; its
-    period; simulated time.
+    """Clock and grid of one other rack.
+
+    Attributes:
+        peer: The rack.
+        put: Sends a ping to it.
+        offset: Offset of its clock.
+        sent: Time of each unanswered ping by its serial, ns.
+        due_ns: Time of the next ping, ns.
+        met: Launch and number of losses for which the measurements hold.
+        epoch_ns: Its CLOCK_MONOTONIC at its tick 0, or 0 before that.
+        period_ns: Real length of its tick, ns.
+        clock_ns: Simulated length of its tick, ns.
     """
 
     peer: PeerRack
@@ -134,7 +154,7 @@ class PeerClock:
     clock_ns: int = 0
 
     def begin(self) -> None:
-        """Forget what was measured, if that was another launch, or before the rack was lost."""
+        """Discard measurements that were made before a new launch or a loss of the rack."""
         met = (self.peer.launch, self.peer.losses)
         if met != self.met:
             self.met = met
@@ -145,7 +165,11 @@ class PeerClock:
             self.sent.clear()
 
     def time_ns(self, stamp_ns: int) -> int:
-        """Return its simulated time at a CLOCK_MONOTONIC of its machine; 0 before its tick 0."""
+        """Convert a CLOCK_MONOTONIC stamp of the other machine to the rack's simulated time, ns.
+
+        Returns:
+            The simulated time, 0 before tick 0 of that rack.
+        """
         return (
             max(0, stamp_ns - self.epoch_ns) * self.clock_ns // self.period_ns
             if self.epoch_ns
@@ -154,10 +178,15 @@ class PeerClock:
 
 
 class Clocks:
-    """Compares the clocks of all peers with ours; not in lockstep, where all racks have one
-    simulated time.
+    """Measures the clocks of all peers. Not used in lockstep, where racks share simulated time.
 
-    Pings of other racks are answered from the network's threads, each rack's at a bounded rate.
+    Pings of other racks are answered from zenoh's threads, at a bounded rate for each rack.
+
+    Attributes:
+        taken: Number of answers accepted.
+        answered: Number of pings answered.
+        withheld: Number of pings not answered because of the rate limit.
+        refused: Number of malformed or unexpected pings and answers.
     """
 
     def __init__(self, segment: Segment, peers: Peers, launch: int, grid: OwnGrid) -> None:
@@ -170,20 +199,20 @@ class Clocks:
         self.taken = self.answered = self.withheld = self.refused = 0
         self._put: dict[str, Any] = {}
         self._again: dict[str, int] = {}
-        # Each link of the network has its own thread.
+        # Each link of the network calls back from a separate thread.
         self._lock = Lock()
-        # Of no ping that an adapter before this one may have sent.
+        # Start above every serial that this adapter may have used before a restart.
         self._serial = monotonic_ns()
         self._now_ns = 0
 
     def open(self, link: LanLink, sealer: Sealer) -> None:
-        """Answer other racks, and get ready to ask them."""
+        """Start to answer other racks and prepare to ping them."""
         if self._grid.is_lockstep:
             return
         self._link = link
         self._sealer = sealer
         link.on(ping_key("*", self._rack), self._on_ping)
-        # A tuple is whole or not there: no lock is needed.
+        # Appending a tuple to a deque is atomic, so no lock is needed.
         link.on(
             pong_key("*", self._rack), lambda pong: self._arrived.append((monotonic_ns(), pong))
         )
@@ -191,11 +220,12 @@ class Clocks:
             clock.put = link.publish(ping_key(self._rack, rack))
 
     def _on_ping(self, ping: Arrived) -> None:
+        """Answer a ping, unless it is malformed or too early. Called in a thread of zenoh."""
         received = monotonic_ns()
         asker = ping.key.split("/")[1]
         with self._lock:
-            again = self._again.get(asker)
-            if received < (again or 0) or (again is None and len(self._again) == MOST_ASKERS):
+            next_ns = self._again.get(asker)
+            if received < (next_ns or 0) or (next_ns is None and len(self._again) == MOST_ASKERS):
                 self.withheld += 1
                 return
             head = self._sealer.opened(*ping)
@@ -216,7 +246,7 @@ class Clocks:
             self._put[asker](content, self._sealer.seal(key, pong, content))
 
     def exchange(self) -> None:
-        """Take the answers that have come, and ask again where it is time."""
+        """Process the answers that have arrived and send the pings that are due."""
         if self._grid.is_lockstep:
             return
         for clock in self._clocks.values():
@@ -227,60 +257,68 @@ class Clocks:
             else:
                 with self._lock:
                     self.refused += 1
-        self._now_ns = now = monotonic_ns()
+        self._now_ns = now_ns = monotonic_ns()
         for rack, clock in self._clocks.items():
-            if clock.peer.is_there and now >= clock.due_ns:
-                self._ask(rack, clock, now)
+            if clock.peer.is_there and now_ns >= clock.due_ns:
+                self._ask(rack, clock, now_ns)
             best = clock.offset.best
             clock.peer.offset_ns = None if best is None else best.offset_ns
-            clock.peer.uncertainty_ns = 0 if best is None else best.uncertainty_ns(now)
+            clock.peer.uncertainty_ns = 0 if best is None else best.uncertainty_ns(now_ns)
 
-    def _ask(self, rack: str, clock: PeerClock, now: int) -> None:
-        clock.due_ns = now + (PING_NS if len(clock.offset) >= EAGER else EAGER_NS)
+    def _ask(self, rack: str, clock: PeerClock, now_ns: int) -> None:
+        """Send a ping and schedule the next one."""
+        clock.due_ns = now_ns + (PING_NS if len(clock.offset) >= EAGER else EAGER_NS)
         self._serial += 1
         while len(clock.sent) >= UNANSWERED:
             del clock.sent[next(iter(clock.sent))]
-        clock.sent[self._serial] = sent = monotonic_ns()
-        head = Envelope(_PING_KIND, self._launch, self._serial, self._serial, 0, 0, sent)
+        clock.sent[self._serial] = sent_ns = monotonic_ns()
+        head = Envelope(_PING_KIND, self._launch, self._serial, self._serial, 0, 0, sent_ns)
         clock.put(b"", self._sealer.seal(ping_key(self._rack, rack), head, b""))
 
     def _is_taken(self, arrived_ns: int, pong: Arrived) -> bool:
-        """Take an answer; return False for one that is damaged, or to nothing that was asked."""
+        """Process an answer. Return False if it is damaged or answers no ping of ours."""
         head = self._sealer.opened(*pong)
         if isinstance(head, Flaw) or head.kind != _PONG_KIND or len(pong.payload) != _PONG.size:
             return False
         clock = self._clocks.get(pong.key.split("/")[1])
-        launch, received, epoch, period, clock_ns = _PONG.unpack(pong.payload)
+        launch, received_ns, epoch_ns, period_ns, clock_ns = _PONG.unpack(pong.payload)
         if (
             clock is None
             or launch != self._launch
             or head.launch != clock.peer.launch
-            or min(period, clock_ns) < 1
+            or min(period_ns, clock_ns) < 1
         ):
             return False
         sent = clock.sent.pop(head.serial, None)
         if sent is None or not clock.offset.add(
-            RoundTrip(sent, received, head.stamp_ns, arrived_ns)
+            RoundTrip(sent, received_ns, head.stamp_ns, arrived_ns)
         ):
             return False
-        clock.epoch_ns = epoch
-        clock.period_ns = period
+        clock.epoch_ns = epoch_ns
+        clock.period_ns = period_ns
         clock.clock_ns = clock_ns
         return True
 
     def is_unanswered(self, peer: PeerRack, tick: int) -> bool:
-        """Say whether the clock of a rack that is there has not been measured for long: its
-        messages are held back.
+        """Return True if the clock of a present rack has not been measured for too long.
+
+        The messages of such a rack are held back, because their age is unknown.
         """
         is_unknown = peer.is_there and peer.offset_ns is None and not self._grid.is_lockstep
         return is_unknown and tick - peer.since > self._grid.ticks_in(UNKNOWN_NS)
 
     def count(self, record: Any) -> None:
-        """Write the counts into the group of a status."""
+        """Write the counters into the group of a status."""
         fill_counts(record, (self.taken, self.answered, self.withheld, self.refused))
 
     def fill(self, out: Any, rack: str, tick: int) -> None:
-        """Write what is known of a rack's clock into its mailbox: see `rack.levels.peer`."""
+        """Write what is known of a rack's clock into its mailbox.
+
+        Args:
+            out: The message to fill, a `rack.levels.peer.PeerPresence`.
+            rack: Name of the other rack.
+            tick: Current tick of this rack.
+        """
         clock = self._clocks[rack]
         out.steps = clock.offset.steps
         best = clock.offset.best

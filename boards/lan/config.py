@@ -1,6 +1,4 @@
-"""`[adapter.lan]`: what a rack exchanges with others over a network, with whom, and by which
-rules.
-"""
+"""Tables of `[adapter.lan]`: exports, imports, other racks and the rules of access."""
 
 from __future__ import annotations
 
@@ -15,9 +13,9 @@ from rack.levels.references import module_and_name
 from rack.levels.tables import Positive, Table
 
 FASTEST_HZ = 50.0
-"""Fastest exchange over a network."""
+"""Highest rate of an exchange over a network."""
 MOST_CHAIN = 8192
-"""Bytes of a rack's certificates in DER form, as they travel with its seals."""
+"""Maximum size of a rack's certificates in DER form, bytes. They are sent with every seal."""
 MessageKind = type[Message]
 OnPeerLoss = Literal["hold", "stop", "go on"]
 PeerName = Annotated[str, StringConstraints(pattern=f"^{RACK_NAME}$")]
@@ -33,7 +31,12 @@ ENDPOINT_NOTE = (
 
 
 class Credential(Exception):
-    """A file of `certificates` that cannot be used: its path, and why."""
+    """A credential file that cannot be used.
+
+    Attributes:
+        path: Path of the file.
+        why: What is wrong with it.
+    """
 
     def __init__(self, path: Path, why: str) -> None:
         super().__init__(f"{path}: {why}")
@@ -51,9 +54,7 @@ class ExportConfig(Table):
 
 
 class ImportConfig(Table):
-    """`[adapter.lan.import.<port>]`: one mailbox of another rack, which levels here read as
-    `lan.<port>`.
-    """
+    """`[adapter.lan.import.<port>]`: a mailbox of another rack, read by levels as `lan.<port>`."""
 
     source: Remote = Field(alias="from")
     """rack and mailbox, as in cell/task.orders"""
@@ -66,26 +67,31 @@ class ImportConfig(Table):
 
     @property
     def rack(self) -> str:
-        """Name of the rack that writes it."""
+        """Name of the rack that writes the mailbox."""
         return self.source.partition("/")[0]
 
     @property
     def mailbox(self) -> str:
-        """Name of the mailbox there."""
+        """Name of the mailbox in that rack."""
         return self.source.partition("/")[2]
 
     def message_class(self) -> MessageKind:
-        """Return the message class. Raises `LookupError` with the reason if there is none."""
+        """Import the message class.
+
+        Raises:
+            LookupError: The module or the class does not exist, or the class is not a message.
+        """
         module, name = module_and_name(self.type)
-        found = getattr(module, name, None)
-        if not (isinstance(found, type) and issubclass(found, Message)):
+        message_class = getattr(module, name, None)
+        if not (isinstance(message_class, type) and issubclass(message_class, Message)):
             raise LookupError(f"module '{module.__name__}' has no message class '{name}'")
-        return found
+        return message_class
 
 
 class LanTable(Table):
-    """The keys of `[adapter.lan]` that concern the network; those of its board are declared with
-    the boards'.
+    """Keys of `[adapter.lan]` that concern the network.
+
+    The keys of its board are declared with the boards.
     """
 
     listen: tuple[str, ...] = Field(
@@ -97,22 +103,21 @@ class LanTable(Table):
     insecure: bool = False
     """permit endpoints without TLS beyond loopback, or without certificates on it"""
     lease_ms: float = Field(500.0, ge=20, le=60_000)
-    """real time of silence from which a peer is lost, ms"""
+    """real time without a sign of life after which a peer counts as lost, ms"""
     on_peer_loss: OnPeerLoss = "hold"
-    """while a rack that was there is lost: hold: levels find what it writes lost at once, and hold,
-    until its first message after that; stop: the same, and the arm ramps to rest, then brakes,
-    until it is back; go on: levels keep its last message, however old"""
+    """reaction to the loss of a peer; hold: levels find its mailboxes lost at once and hold until
+    its next message; stop: in addition, the arm ramps to rest and brakes until the peer is back;
+    go on: levels keep its last message, however old"""
     peers: tuple[PeerName, ...] = ()
-    """racks with which this one works, besides those from which it imports: they may import, and
+    """racks with which this one works, besides the ones from which it imports; they may import, and
     lockstep waits for them"""
     launch: tuple[str, ...] = ()
-    """configs of racks that `rack run` launches with this one, on this machine; each in a process
-    of its own"""
+    """configs of racks that `rack run` also launches on this machine, each in a separate process"""
     estop_from: tuple[PeerName, ...] = ()
     """names, proved by certificates, that may set the emergency stop from another machine, with
     rack estop HOST/RACK"""
     most_bytes: int = Field(16_384, ge=64, le=1 << 20)
-    """length of the longest message taken; bytes"""
+    """length of the longest message that is accepted, bytes"""
     exports: dict[PortName, ExportConfig] = Field({}, alias="export")
     """mailboxes that others may import"""
     imports: dict[PortName, ImportConfig] = Field({}, alias="import")
@@ -120,5 +125,5 @@ class LanTable(Table):
 
     @property
     def racks(self) -> tuple[str, ...]:
-        """The racks with which this one works: those from which it imports, and `peers`."""
+        """Names of the racks with which this rack works: the ones it imports from, and `peers`."""
         return tuple(dict.fromkeys([*(entry.rack for entry in self.imports.values()), *self.peers]))

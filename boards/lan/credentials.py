@@ -1,11 +1,10 @@
-"""The credentials of a rack on the network: a folder with the authority, and with its own
-certificate and key.
+"""Credentials of a rack on the network: a folder with the authority and the rack's key.
 
-authority.pem    certificates of the authority that signs every rack of this network
-RACK.pem         certificate of this rack, and those that lead from it to the authority: its common
-                 name is the rack's name, its alternative names are addresses
-RACK-key.pem     private key of that certificate, for its owner's eyes only: it proves the rack to
-                 those who connect, and seals what it sends
+authority.pem   certificates of the authority that signs every rack of this network
+RACK.pem        certificate of this rack and the ones that lead from it to the authority. Its
+                common name is the rack's name; its alternative names are addresses.
+RACK-key.pem    private key of that certificate, readable by its owner only. It proves the
+                rack's identity to those who connect, and seals what the rack sends.
 """
 
 from __future__ import annotations
@@ -53,7 +52,7 @@ from rack.boards.lan.config import MOST_CHAIN, Credential
 AUTHORITY = "authority.pem"
 MAX_CREDENTIAL_BYTES = 100_000
 MOST_KNOWN = 1024
-"""Certificates of others that are remembered."""
+"""Maximum number of senders whose checked certificates are remembered."""
 OTHERS = stat.S_IRWXG | stat.S_IRWXO
 OWNER_ONLY = 0o600
 MINUTE = "%Y-%m-%d %H:%M"
@@ -61,25 +60,25 @@ _ALGORITHM = ECDSA(Prehashed(SHA256()))
 
 
 class KeyPair(NamedTuple):
-    """A rack's certificates, as they travel with its seals, and its key."""
+    """Certificates of a rack in DER form, as they are sent with its seals, and its private key."""
 
     chain: bytes
     key: EllipticCurvePrivateKey
 
     def sign(self, digest: bytes) -> bytes:
-        """Return the signature of 32 bytes."""
+        """Return the signature of a digest of 32 bytes."""
         return self.key.sign(digest, _ALGORITHM)
 
 
 class Identity(NamedTuple):
-    """Whom certificates name, with the key that checks its signatures."""
+    """Name and public key from a checked certificate, and the time of its expiry."""
 
     name: str
     key: EllipticCurvePublicKey
     expires: datetime
 
     def has_signed(self, digest: bytes, signature: bytes) -> bool:
-        """Say whether it has made a signature of 32 bytes."""
+        """Return True if the signature of the 32-byte digest was made with this identity's key."""
         try:
             self.key.verify(signature, digest, _ALGORITHM)
         except InvalidSignature:
@@ -88,7 +87,14 @@ class Identity(NamedTuple):
 
 
 class Credentials:
-    """The files of one rack in a folder."""
+    """Credential files of one rack.
+
+    Attributes:
+        rack: Name of the rack.
+        authority: Path of the authority's certificates.
+        certificate: Path of the rack's certificate.
+        key: Path of the rack's private key.
+    """
 
     def __init__(self, folder: Path, rack: str) -> None:
         self.rack = rack
@@ -99,63 +105,81 @@ class Credentials:
 
     @cached_property
     def pair(self) -> KeyPair:
-        """What it seals with. Raises `Credential`."""
+        """Certificates and key with which the rack seals. Raises `CredentialError`."""
         chain = load_certificates(self.certificate)
-        content = b"".join(one.public_bytes(Encoding.DER) for one in chain)
+        content = b"".join(certificate.public_bytes(Encoding.DER) for certificate in chain)
         if len(content) > MOST_CHAIN:
-            raise Credential(self.certificate, f"{len(content)} bytes; permitted: {MOST_CHAIN}")
+            raise Credential(
+                self.certificate,
+                f"the certificates have {len(content)} bytes; at most {MOST_CHAIN} are allowed",
+            )
         key = load_private_key(self.key)
         if key.public_key() != chain[0].public_key():
-            raise Credential(self.key, f"not the key of {self.certificate.name}")
+            raise Credential(self.key, f"the key does not belong to {self.certificate.name}")
         return KeyPair(content, key)
 
     def identity(self, chain: bytes) -> Identity | None:
-        """Return whom certificates name that came with a seal; None: nobody whom the authority has
-        signed, or not any more. Raises `Credential`: the authority cannot be read.
+        """Return the identity in certificates that arrived with a seal.
+
+        Returns:
+            None if the authority has not signed them or if they have expired.
+
+        Raises:
+            CredentialError: The authority's certificates cannot be read.
         """
-        found = self._known.get(chain)
-        if found is None:
-            if (found := _identified(chain, self._authorities)) is None:
+        identity = self._known.get(chain)
+        if identity is None:
+            if (identity := _identified(chain, self._authorities)) is None:
                 return None
             if len(self._known) >= MOST_KNOWN:
                 self._known.clear()
-            self._known[chain] = found
-        return found if datetime.now(UTC) < found.expires else None
+            self._known[chain] = identity
+        return identity if datetime.now(UTC) < identity.expires else None
 
     @cached_property
     def _authorities(self) -> list[Certificate]:
+        """Certificates of the authority."""
         return load_certificates(self.authority)
 
     @property
     def expires(self) -> datetime:
-        """When the first of the certificates expires. Raises `Credential`."""
+        """Time at which the first of the certificates expires. Raises `CredentialError`."""
         return min(
-            one.not_valid_after_utc
+            certificate.not_valid_after_utc
             for path in (self.authority, self.certificate)
-            for one in load_certificates(path)
+            for certificate in load_certificates(path)
         )
 
     def flaws(self, addresses: Iterable[str] = ()) -> Iterator[Credential]:
-        """Yield what is wrong with each file, now. `addresses` are those at which others reach this
-        rack.
+        """Yield what is wrong with each file at present.
+
+        Args:
+            addresses: Addresses at which others reach this rack. The certificate must contain all
+                of them.
         """
-        found: dict[Path, list[Certificate]] = {self.authority: [], self.certificate: []}
-        for path in found:
+        certificates: dict[Path, list[Certificate]] = {self.authority: [], self.certificate: []}
+        for path in certificates:
             try:
-                found[path] = load_certificates(path)
+                certificates[path] = load_certificates(path)
             except Credential as flaw:
                 yield flaw
-        authorities, chain = found.values()
+        authorities, chain = certificates.values()
         if chain:
             if (name := _common_name(chain[0])) != self.rack:
-                yield Credential(self.certificate, f"for '{name}', not for rack '{self.rack}'")
+                yield Credential(
+                    self.certificate,
+                    f"the certificate is for '{name}' instead of rack '{self.rack}'",
+                )
             if authorities and not _path(chain, authorities):
-                yield Credential(self.certificate, f"not signed by {self.authority.name}")
-            known = _addresses(chain[0])
-            if lost := [address for address in addresses if address not in known]:
-                permitted = ", ".join(known) or "none"
-                why = f"not for address {', '.join(lost)}; for {permitted}"
-                yield Credential(self.certificate, why)
+                yield Credential(
+                    self.certificate, f"the certificate is not signed by {self.authority.name}"
+                )
+            certified = _addresses(chain[0])
+            if missing := [address for address in addresses if address not in certified]:
+                why = f"the certificate is not valid for address {', '.join(missing)}"
+                yield Credential(
+                    self.certificate, f"{why}; valid addresses: {', '.join(certified) or 'none'}"
+                )
         try:
             _ = self.pair if chain else load_private_key(self.key)
         except Credential as flaw:
@@ -163,95 +187,114 @@ class Credentials:
 
 
 def _content(path: Path, is_private: bool = False) -> bytes:
+    """Return the content of a credential file. A private one must be readable by its owner only."""
     try:
         if is_private and (mode := stat.S_IMODE(path.stat().st_mode)) & OTHERS:
             raise Credential(
-                path, f"others may read it, mode {mode:04o}; permitted: {OWNER_ONLY:04o}"
+                path, f"mode {mode:04o} lets others read it; it must be {OWNER_ONLY:04o}"
             )
         return read_regular_file(path, MAX_CREDENTIAL_BYTES)
     except FileNotFoundError:
-        raise Credential(path, "missing; see rack lan certificates --help") from None
+        raise Credential(path, "the file is missing; see rack lan certificates --help") from None
     except OSError as error:
         raise Credential(path, f"cannot be read: {error.strerror}") from None
 
 
 def load_certificates(path: Path) -> list[Certificate]:
-    """Return the certificates of a PEM file that are valid now. Raises `Credential`."""
+    """Return the certificates of a PEM file, all of which must be valid now.
+
+    Raises:
+        CredentialError: The file cannot be read, or a certificate is malformed, expired or not yet
+            valid.
+    """
     content = _content(path)
     try:
-        found = load_pem_x509_certificates(content)
+        certificates = load_pem_x509_certificates(content)
     except (ValueError, InvalidVersion):
-        raise Credential(path, "no certificate in PEM form") from None
-    now = datetime.now(UTC)
-    for certificate in found:
+        raise Credential(path, "the file contains no certificate in PEM form") from None
+    now_utc = datetime.now(UTC)
+    for certificate in certificates:
         first, last = certificate.not_valid_before_utc, certificate.not_valid_after_utc
-        if not first <= now <= last:
+        if not first <= now_utc <= last:
             why = (
-                f"not valid before {first:{MINUTE}}"
-                if now < first
-                else f"expired on {last:{MINUTE}}"
+                f"the certificate is not valid before {first:{MINUTE}}"
+                if now_utc < first
+                else f"the certificate expired on {last:{MINUTE}}"
             )
             raise Credential(path, f"{why} UTC")
-    return found
+    return certificates
 
 
 def load_private_key(path: Path) -> EllipticCurvePrivateKey:
-    """Return the key of a PEM file. Raises `Credential`."""
+    """Return the private key of a PEM file. It must be unencrypted and on the curve P-256.
+
+    Raises:
+        CredentialError: The file cannot be read or its key cannot be used.
+    """
     content = _content(path, is_private=True)
     try:
         key = load_pem_private_key(content, None)
     except TypeError:
-        raise Credential(path, "encrypted; permitted: a key without a password") from None
+        raise Credential(path, "the key is encrypted; it must have no password") from None
     except (ValueError, UnsupportedAlgorithm):
-        raise Credential(path, "no private key in PEM form") from None
+        raise Credential(path, "the file contains no private key in PEM form") from None
     if not isinstance(key, EllipticCurvePrivateKey) or not _is_p256(key.public_key()):
-        raise Credential(path, "of another kind; permitted: a key on the curve P-256")
+        raise Credential(path, "the key is of another kind; it must be on the curve P-256")
     return key
 
 
 def _is_p256(key: object) -> TypeGuard[EllipticCurvePublicKey]:
-    """Say whether a key is on the curve whose signatures are short and quick to check."""
+    """Return True if a public key is on P-256, whose signatures are short and quick to check."""
     return isinstance(key, EllipticCurvePublicKey) and isinstance(key.curve, SECP256R1)
 
 
 def _identified(chain: bytes, authorities: list[Certificate]) -> Identity | None:
-    """Return whom certificates in DER form name; None: they do not lead to an authority."""
-    found = []
+    """Return the identity in a chain of DER certificates, or None if no authority signed it."""
+    certificates = []
     try:
         while chain:
-            # Each says its length itself, in two bytes after the first two.
+            # Bytes 2 and 3 of a DER certificate of this size contain its length.
             size = 4 + int.from_bytes(chain[2:4], "big")
-            found.append(load_der_x509_certificate(chain[:size]))
+            certificates.append(load_der_x509_certificate(chain[:size]))
             chain = chain[size:]
-        path = _path(found, authorities)
-        name = _common_name(found[0])
-        key = found[0].public_key()
+        trusted = _path(certificates, authorities)
+        name = _common_name(certificates[0])
+        key = certificates[0].public_key()
     except Exception:
-        # A stranger's bytes, and what they raise is not all documented: some are no `ValueError`.
+        # The bytes come from a stranger, and the parser may raise undocumented exceptions.
         return None
-    if not path or not _is_p256(key):
+    if not trusted or not _is_p256(key):
         return None
-    return Identity(name, key, min(one.not_valid_after_utc for one in path))
+    expires = min(certificate.not_valid_after_utc for certificate in trusted)
+    return Identity(name, key, expires)
 
 
 def _common_name(certificate: Certificate) -> str:
+    """Return the common name of a certificate, or an empty string."""
     names = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
     return str(names[0].value) if names else ""
 
 
 def _addresses(certificate: Certificate) -> list[str]:
+    """Return the addresses and host names for which a certificate is valid."""
     try:
-        found = certificate.extensions.get_extension_for_class(SubjectAlternativeName).value
+        alternatives = certificate.extensions.get_extension_for_class(SubjectAlternativeName).value
     except (ExtensionNotFound, ValueError):
         return []
-    return [*map(str, found.get_values_for_type(IPAddress)), *found.get_values_for_type(DNSName)]
+    return [
+        *map(str, alternatives.get_values_for_type(IPAddress)),
+        *alternatives.get_values_for_type(DNSName),
+    ]
 
 
 def _path(chain: list[Certificate], authorities: list[Certificate]) -> list[Certificate]:
-    """Return the certificates from the first of a chain to an authority; empty: it does not lead
-    there, as where the certificate of a rack has signed another one.
+    """Return the certificates from the first of a chain up to an authority.
+
+    Returns:
+        An empty list if the chain does not lead to an authority, for example if the certificate of
+        one rack has signed the certificate of another.
     """
-    # As TLS does: of an authority that it says to be one, of a rack or person no more than that.
+    # As in TLS, an authority must be marked as one. Other certificates may have any extensions.
     any_kind = ExtensionPolicy.permit_all()
     authority = any_kind.require_present(BasicConstraints, Criticality.AGNOSTIC, None)
     policy = PolicyBuilder().store(Store(authorities))

@@ -1,4 +1,4 @@
-"""Endpoints: where a session listens, or connects to."""
+"""Endpoints at which a session listens or to which it connects."""
 
 from __future__ import annotations
 
@@ -16,14 +16,16 @@ _SHAPE = re.compile(r"(tcp|tls|quic)/(\[[0-9a-fA-F:.]+\]|[A-Za-z0-9._-]+):([0-9]
 _OWN = re.compile(rf"{UNIX}/({RACK_NAME})")
 _NUMBERS = re.compile(r"[0-9.]*")
 PERMITTED = (
-    "permitted: tcp/, tls/ or quic/, an address or a host name, and a port from 1 to 65535; or"
-    " unix/ and a name"
+    "it must be tcp/, tls/ or quic/ with an address or host name and a port from 1 to 65535, or"
+    " unix/ with a name"
 )
 
 
 class Endpoint(NamedTuple):
-    """An endpoint; `host` is a name, or an address without brackets; of a Unix socket, its own
-    name.
+    """Address of a session.
+
+    `host` is a host name, or an address without brackets. For a Unix socket it is the socket's
+    name, and `port` is 0.
     """
 
     protocol: str
@@ -32,40 +34,44 @@ class Endpoint(NamedTuple):
 
     @classmethod
     def of(cls, text: str) -> Endpoint:
-        """Return the endpoint in a text. Raises `ValueError`: it is malformed."""
-        if (own := _OWN.fullmatch(text)) is not None:
-            return cls(UNIX, own[1], 0)
-        found = _SHAPE.fullmatch(text)
-        if found is None or not 0 < int(found[3]) <= 65535:
+        """Parse an endpoint.
+
+        Raises:
+            ValueError: The text is malformed. The message says what is valid.
+        """
+        if (socket := _OWN.fullmatch(text)) is not None:
+            return cls(UNIX, socket[1], 0)
+        match = _SHAPE.fullmatch(text)
+        if match is None or not 0 < int(match[3]) <= 65535:
             raise ValueError(PERMITTED)
-        host = found[2].strip("[]")
-        # What looks like an address must be one: resolvers take 127.1 and 300 for addresses too.
+        host = match[2].strip("[]")
+        # Reject incomplete addresses: resolvers would accept 127.1 or 300 as an address.
         if ":" in host or _NUMBERS.fullmatch(host):
             try:
                 ip_address(host)
             except ValueError:
-                raise ValueError(f"'{host}' is no address; {PERMITTED}") from None
-        return cls(found[1], host, int(found[3]))
+                raise ValueError(f"'{host}' is not an address; {PERMITTED}") from None
+        return cls(match[1], host, int(match[3]))
 
     def __str__(self) -> str:
-        """Return it as a text."""
+        """Return the endpoint as a config contains it."""
         if self.is_private:
             return f"{UNIX}/{self.host}"
         return f"{self.protocol}/{f'[{self.host}]' if ':' in self.host else self.host}:{self.port}"
 
     @property
     def has_tls(self) -> bool:
-        """Whether both sides show certificates."""
+        """Whether both sides must show certificates."""
         return self.protocol in TLS
 
     @property
     def is_private(self) -> bool:
-        """Whether only this user's processes can reach it."""
+        """Whether only processes of this user can connect to it."""
         return self.protocol == UNIX
 
     @property
     def is_loopback(self) -> bool:
-        """Whether only this machine can reach it."""
+        """Whether only this machine can connect to it."""
         with suppress(ValueError):
             return ip_address(self.host).is_loopback
         return self.host == "localhost"
@@ -79,14 +85,14 @@ class Endpoint(NamedTuple):
 
 
 def endpoints_of(table: LanTable) -> list[Endpoint]:
-    """Return the endpoints of a table; malformed ones are mistakes that are reported elsewhere."""
-    found = []
+    """Return the endpoints of a table. Malformed ones are left out; the rules report them."""
+    endpoints = []
     for text in (*table.listen, *table.connect):
         with suppress(ValueError):
-            found.append(Endpoint.of(text))
-    return found
+            endpoints.append(Endpoint.of(text))
+    return endpoints
 
 
 def has_tls(table: LanTable) -> bool:
-    """Return True if the others are known by their certificates."""
+    """Return True if an endpoint uses TLS, so that others are known by their certificates."""
     return any(endpoint.has_tls for endpoint in endpoints_of(table))

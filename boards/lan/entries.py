@@ -1,4 +1,4 @@
-"""Exports and imports at work: one mailbox each, between backplane and network."""
+"""Exports and imports: each passes one mailbox between backplane and network."""
 
 from __future__ import annotations
 
@@ -23,47 +23,49 @@ from rack.boards.lan.status import LanExport, LanImport, zero_counts
 from rack.levels.ports import Sender
 
 LARGEST = 1 << 62
-"""Greater than every number of a launch, serial or message: larger values are forged."""
+"""Exclusive upper limit of valid launch, serial and message numbers. Larger values are forged."""
 
 
 WINDOW = 64
-"""Newest messages of an import of which it is known whether they came."""
+"""Number of recent message numbers whose arrival is remembered."""
 _WHOLE = (1 << WINDOW) - 1
 
 
 class MessageOrder:
-    """The messages of one import as they were sent: which is new, which came twice, which are
-    missing.
+    """Tracks the message numbers of one import and counts gaps, repeats and late arrivals.
 
     Attributes:
-        count: Counts all of it, and holds number and serial of the newest message.
-        launch: The launch of the newest message: see `Envelope`.
+        count: Counters of the import, with number and serial of the newest message.
+        launch: Launch of the newest message: see `Envelope`.
     """
 
     def __init__(self, count: LanImport) -> None:
         self.count = count
         self.launch = NONE
-        self._came = 0  # bit n: message `number` - n came
+        self._came = 0  # bit n is set if message `number` - n has arrived
 
     def resume(self) -> None:
-        """Continue after the message in the counts; those before it count as having come."""
+        """Continue after the newest message in the counters. All earlier ones count as arrived."""
         self.launch = self.count.launch
         self._came = _WHOLE
 
     def admits(self, head: Envelope) -> bool:
-        """Return True if a message is newer than all before it. Count what is missing before it, or
-        else why it is not newer.
+        """Record a message and decide whether it should be delivered.
+
+        Returns:
+            True if the message is newer than every earlier one. Gaps before it are counted as
+            missing. Any other message is counted as repeated or disordered.
         """
         count = self.count
         if head.launch != self.launch:
-            # Resumed in lockstep, where launches are not on record, it is the same one. What
-            # another launch sent before its first message is not missing.
+            # After a restart in lockstep, which records no launches, it is the same launch.
+            # Otherwise it is a new one, whose messages before this one do not count as missing.
             if self.launch != NONE or not count.serial:
                 count.number = head.number
                 count.serial = 0
                 self._came = 0
             self.launch = head.launch
-        # A sender that was restarted may give one number twice.
+        # A restarted sender may use a number twice, so the serial decides what is newer.
         step = head.number - count.number
         if head.serial <= count.serial:
             bit = 1 << min(max(0, -step), WINDOW)
@@ -81,9 +83,13 @@ class MessageOrder:
 
 
 class Export:
-    """A mailbox of this rack: each new message is sent, in every n-th cycle, n being `every`.
+    """Sends the messages of one mailbox of this rack.
 
-    `is_asked`: somebody has come who needs the newest message even if it is not new.
+    Attributes:
+        every: Period of the exchange in cycles of the adapter.
+        is_asked: Whether a rack has joined that needs the newest message even if it was sent
+            before.
+        count: Counters of the export.
     """
 
     def __init__(self, segment: Segment, table: ExportConfig, launch: int, grid: OwnGrid) -> None:
@@ -99,32 +105,34 @@ class Export:
         self._put: Callable[[bytes, bytes], None]
 
     def resume(self, record: Any) -> None:
-        """Continue with the counts in the status of an adapter before this one."""
+        """Restore the counters from the status of the previous adapter."""
         self.count.record[...] = record
 
     def open(self, carrier: LanLink | Barrier, sealer: Sealer) -> None:
-        """Publish it."""
+        """Start publishing through a network link or, in lockstep, through a barrier."""
         self._put = carrier.publish(self._key)
         self._sealer = sealer
 
     def recall(self, tick: int, ticks: int) -> None:
-        """Send what an adapter before this one sent at `tick`, if it did; `ticks` are those of its
-        cycle.
+        """Repeat the message that the previous adapter sent at `tick`, if it sent one.
+
+        Args:
+            tick: Release of the last cycle of the previous adapter.
+            ticks: Length of the adapter's cycle in ticks.
         """
         if (tick // ticks) % self.every:
             return
         self._source.read(tick - self.every * ticks)
-        before = self._source.serial
+        previous_serial = self._source.serial
         self._source.read(tick)
-        if self._source.serial == self.count.serial != before:
+        if self._source.serial == self.count.serial != previous_serial:
             self.count.sent -= 1
-            self.count.serial = before
+            self.count.serial = previous_serial
             self.exchange(tick)
 
     def exchange(self, tick: int) -> None:
-        """Send the newest message, if it is new or asked for."""
-        # Not the reading of the port: it does not say which message it is, and when that was
-        # written.
+        """Send the newest message if it is new or if a rack that joined needs it."""
+        # The reading of the port is not used, because it has no serial and no time of writing.
         source = self._source
         grid = self._grid
         reading = source.read(tick)
@@ -137,23 +145,27 @@ class Export:
         elif not self.is_asked or grid.is_lockstep:
             return
         self.is_asked = False
-        written = source.newest
+        written_tick = source.newest
         payload = bytes(reading.message.raw)
-        times = written, grid.time_ns(written), grid.stamp_ns(written)
+        times = written_tick, grid.time_ns(written_tick), grid.stamp_ns(written_tick)
         head = Envelope(self._kind, self._launch, count.serial, count.sent, *times)
         self._put(payload, self._sealer.seal(self._key, head, payload))
 
     def fill(self, record: Any) -> None:
-        """Write its counts into the group of a status."""
+        """Write the counters into the group of a status."""
         fill_counts(record, self.count.record.item())
 
 
 class Import:
-    """A mailbox of another rack: the newest good message of each exchange becomes one here.
+    """Receives the messages of one mailbox of another rack.
 
-    Its type is that of the mailbox `lan.<port>` into which it is written. While its rack is lost,
-    and until its first message after that, readers there find the writer lost or, if levels are to
-    go on, the last message not too old.
+    Each exchange writes the newest good message to the mailbox `lan.<port>`. While the other rack
+    is lost, and until its first message after its return, readers find the writer lost. If the
+    config lets levels keep messages, they find the last message instead, unless it is too old.
+
+    Attributes:
+        every: Period of the exchange in cycles of the adapter.
+        count: Counters of the import.
     """
 
     def __init__(
@@ -175,54 +187,60 @@ class Import:
         self._grid = grid
         self.every = grid.cycles(table.rate_hz)
         self._basis: int | None = None
-        # The newest message that came before its time, with the tick at which it came.
+        # Newest message that arrived before it could be accepted, with the tick of its arrival.
         self._early: list[tuple[int, Arrived]] = []
         self.count = zero_counts(LanImport)
         self._order = MessageOrder(self.count)
         self._arrived: Callable[[], Iterator[Arrived]]
 
     def resume(self, record: Any, tick: int) -> None:
-        """Continue after the status that an adapter before this one wrote at `tick`."""
+        """Restore the state from the status that the previous adapter wrote at `tick`."""
         count = self.count
         count.record[...] = record
         self._order.resume()
         self._basis = None if count.age == NEVER else tick - count.age
 
     def open(self, carrier: LanLink | Barrier, sealer: Sealer) -> None:
-        """Subscribe to it."""
+        """Subscribe through a network link or, in lockstep, through a barrier."""
         self._arrived = carrier.subscribe(self._key)
         self._sealer = sealer
 
     def is_old(self, tick: int) -> bool:
-        """Say whether its information is older than permitted."""
+        """Return True if the newest message is older than its maximum age."""
         return self._basis is not None and tick - self._basis > self._max_age
 
     def look(self, tick: int) -> None:
-        """Void what is here, or keep it, if its rack has been lost since the last look."""
+        """Mark the mailbox as away if its rack was lost since the last call."""
         if self._peer.losses != self._losses:
             self._losses = self._peer.losses
             if not self._is_away:
                 self._switch(True, tick + self._delay if self._grid.is_lockstep else tick)
 
     def comes(self, tick: int) -> None:
-        """Let readers find it again, if it was away, with the message of this cycle."""
+        """Let readers use the mailbox again, from the message that is written in this cycle."""
         if self._is_away:
             self._switch(False, tick + self._delay)
 
     def _switch(self, is_away: bool, tick: int) -> None:
+        """Mark the mailbox as away, or as back, from `tick` on."""
         self._is_away = is_away
         self._box[self._word] = switch(tick, is_away)
 
     def exchange(self, out: Sender[AnyMessage], tick: int) -> None:
-        """Take what has come, and pass the newest good message on."""
+        """Process the messages that have arrived and write the newest good one.
+
+        Args:
+            out: Output port of the import.
+            tick: Current tick.
+        """
         waiting = [*self._early, *((tick, arrived) for arrived in self._arrived())]
         self._early = []
         newest: Envelope | None = None
-        for came, arrived in waiting:
+        for arrival_tick, arrived in waiting:
             head = self._opened(arrived)
             if (
                 head is not None
-                and self._is_due(head, arrived, came, tick)
+                and self._is_due(head, arrived, arrival_tick, tick)
                 and self._is_next(head, arrived.payload)
             ):
                 self.count.superseded += newest is not None
@@ -236,13 +254,14 @@ class Import:
         self.count.taken += 1
         self._basis = basis
         out.message.raw[:] = self._buffer.raw
-        # Ticks of mailboxes are not negative; what was written before this rack's first one is.
+        # Ticks of mailboxes cannot be negative, but the message may predate this rack's tick 0.
         out.send(max(0, basis))
         self.comes(tick)
 
     def _opened(self, arrived: Arrived) -> Envelope | None:
-        """Return the head of what came, if it may be a message of this mailbox; else count that it
-        was refused.
+        """Return the head of a received message, or count the message as refused and return None.
+
+        The seal, the type, the length and the range of the numbers are checked.
         """
         head = self._sealer.opened(*arrived)
         if (
@@ -255,35 +274,42 @@ class Import:
         self.count.refused += 1
         return None
 
-    def _is_due(self, head: Envelope, arrived: Arrived, came: int, tick: int) -> bool:
-        """Return True if a message is of the launch that is there, and of known age. If it may yet
-        be, keep it for later.
+    def _is_due(self, head: Envelope, arrived: Arrived, arrival_tick: int, tick: int) -> bool:
+        """Return True if a message is of the present launch and its age is known.
 
-        In lockstep it is: see `Barrier`.
+        In lockstep that is always true: see `Barrier`. A message that may become acceptable is kept
+        for a later cycle, and replaces the one that was kept before.
+
+        Args:
+            head: Head of the message.
+            arrived: The message as received.
+            arrival_tick: Tick at which it arrived.
+            tick: Current tick.
         """
         if self._grid.is_lockstep:
             return True
-        if self._peer.is_over(head.launch) or tick - came > self._max_age:
+        if self._peer.is_over(head.launch) or tick - arrival_tick > self._max_age:
             self.count.unknown_launch += 1
             return False
-        # Its age decides: until the clocks have been compared it may be too old.
+        # Its age is unknown, and may be too great, until the clocks have been compared.
         if self._is_present(head) and self._peer.offset_ns is not None:
             return True
-        for _, before in self._early:
-            older = self._opened(before)
-            if older is not None and self._is_present(older):
-                # It has come, so it is not missing.
-                self.count.superseded += self._order.admits(older)
+        for _, kept_message in self._early:
+            kept_head = self._opened(kept_message)
+            if kept_head is not None and self._is_present(kept_head):
+                # Record its arrival, so that it does not count as missing.
+                self.count.superseded += self._order.admits(kept_head)
             else:
                 self.count.unknown_launch += 1
-        self._early = [(came, arrived)]
+        self._early = [(arrival_tick, arrived)]
         return False
 
     def _is_present(self, head: Envelope) -> bool:
+        """Return True if a message comes from the launch that is present."""
         return self._peer.is_there and head.launch == self._peer.launch
 
     def _is_next(self, head: Envelope, payload: bytes) -> bool:
-        """Return True if a message is good and the newest so far, and if so keep its content."""
+        """Keep a message and return True if it is well formed and newer than all before it."""
         message = AnyMessage(self._buffer.record.dtype, memoryview(bytearray(payload)))
         if not is_proper(message.record, self._fields):
             self.count.refused += 1
@@ -294,7 +320,7 @@ class Import:
         return True
 
     def fill(self, record: Any, tick: int) -> None:
-        """Write its counts into the group of a status."""
+        """Write the counters and the age of the newest message into the group of a status."""
         count = self.count
         count.launch = NONE if self._grid.is_lockstep else self._order.launch
         count.age = NEVER if self._basis is None else tick - self._basis

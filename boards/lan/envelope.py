@@ -1,14 +1,14 @@
-"""The envelope of a message on the network: from which launch and which write it is, when it was
-written, and a seal.
+"""Envelope of a message on the network: its origin, its time and a seal.
 
-The payload is the message as it lies in its mailbox; nothing is decoded before the seal is checked.
-The seal is a signature over key expression, head and payload, with the key of the sender's
-certificate, which travels along: a message cannot be changed, nor passed off as another mailbox's,
-nor made by another rack in the sender's name. Without certificates it detects damage only.
+The payload is the message as it is stored in its mailbox. Nothing is decoded before the seal is
+checked. The seal is a signature over key expression, head and payload with the key of the sender's
+certificate, which is sent along. A message therefore cannot be changed, presented as a message of
+another mailbox, or made by another rack in the sender's name. Without certificates the seal is a
+plain hash and detects damage only.
 
-Alternatives considered: one secret for all racks (each can speak for any other), one for each pair
-(a mailbox has many readers, so a message would have many seals), certificates of all in each folder
-(they would all change whenever one is renewed).
+Alternatives considered: one secret for all racks (each could speak for any other), one secret for
+each pair (a mailbox has many readers, so a message would need many seals), certificates of all
+racks in each folder (all folders would change whenever one certificate is renewed).
 """
 
 from __future__ import annotations
@@ -32,72 +32,108 @@ if TYPE_CHECKING:
 _HEAD = Struct("<4sIHQQQQqqq")
 _MAGIC = b"RLN2"
 MOST_SEAL = 72
-"""Bytes of the longest seal."""
+"""Length of the longest seal, bytes."""
 MOST_ENVELOPE = _HEAD.size + MOST_CHAIN + MOST_SEAL
 
 
 class Envelope(NamedTuple):
-    """The head of a message."""
+    """Head of a message on the network.
 
-    kind: int  # fingerprint of its type: see `kind_of`
-    launch: int  # random number of the launch whose backplane it is from
-    serial: int  # of the message in its mailbox; of a question, answer or sign, its own
-    # of the message among those sent from its mailbox: it rises by one, `serial` may by more
+    Attributes:
+        kind: Fingerprint of the message type: see `compute_kind`.
+        launch: Random number of the launch that sent the message.
+        serial: Serial of the message in its mailbox. Questions, answers and tokens count
+            separately.
+        number: Number of the message among those sent from its mailbox. Unlike `serial` it has no
+            gaps.
+        tick: Release of the cycle that wrote the message, on the sender's grid.
+        time_ns: Simulated time of that tick.
+        stamp_ns: CLOCK_MONOTONIC of that tick on the sender's machine. In lockstep, `time_ns`.
+        flags: Meaning depends on the kind.
+    """
+
+    kind: int
+    launch: int
+    serial: int
     number: int
-    tick: int  # release of the cycle that wrote it, on its rack's grid
-    time_ns: int  # simulated time of that tick
-    stamp_ns: int  # CLOCK_MONOTONIC of that tick on its machine; in lockstep the simulated time
+    tick: int
+    time_ns: int
+    stamp_ns: int
     flags: int = 0
 
 
 class Flaw(IntEnum):
-    """What is wrong with something that came from the network."""
+    """Reasons for which a received message is rejected unread."""
 
-    MALFORMED = 1  # no head, or not of this version
-    UNSIGNED = 2  # the seal does not fit
+    MALFORMED = 1  # no head, or a head of another version
+    UNSIGNED = 2  # the seal does not match
     OVERSIZED = 3  # longer than permitted
 
 
 def kind_of(name: str, version: int, dtype: np.dtype) -> int:
-    """Return the fingerprint of a message type: equal for equal names, versions and layouts."""
+    """Return the fingerprint of a message type.
+
+    Args:
+        name: Name of the message type.
+        version: Version of the message type.
+        dtype: Layout of its fields. Types with equal names, versions and layouts have equal
+            fingerprints.
+    """
     return xxh3(repr((name, version, dtype.descr)).encode())
 
 
 class Sealer:
-    """Seals and opens envelopes. `flaws`: how often it has found each flaw.
+    """Seals outgoing messages and checks the seals of received ones.
 
-    Raises `Credential` if the files cannot be used.
+    Attributes:
+        flaws: How often each flaw was found.
+
+    Raises:
+        CredentialError: The files cannot be used.
     """
 
     def __init__(self, credentials: Credentials | None = None, most_bytes: int = 1 << 20) -> None:
         self._credentials = credentials
         self._pair = credentials.pair if credentials else None
         if credentials and self._pair:
-            # Here, not in a cycle: the first one takes as long as one.
+            # Identify once now: the first identification takes as long as a whole cycle.
             credentials.identity(self._pair.chain)
         self._most = most_bytes
         self.flaws = dict.fromkeys(Flaw, 0)
 
     def taking(self, most_bytes: int) -> Sealer:
-        """Return one with the same credentials, another limit, and common counts."""
+        """Return a sealer with the same credentials and counters but another length limit."""
         sealer = Sealer(self._credentials, most_bytes)
         sealer.flaws = self.flaws
         return sealer
 
     def resume(self, flaws: Iterable[int]) -> None:
-        """Count on from the flaws that a predecessor has found."""
+        """Continue from the counts of the previous adapter, in the order of `Flaw`."""
         self.flaws |= zip(Flaw, flaws, strict=False)
 
     def seal(self, key: str, head: Envelope, payload: bytes | memoryview) -> bytes:
-        """Return the envelope of a payload to be sent under a key expression."""
+        """Return the envelope of a message.
+
+        Args:
+            key: Key expression under which the message will be sent.
+            head: Head of the message.
+            payload: Content of the message.
+        """
         chain = self._pair.chain if self._pair else b""
         packed = _HEAD.pack(_MAGIC, head.flags, len(chain), *head[:7]) + chain
         digest = _digest(key, packed, payload)
         return packed + (self._pair.sign(digest) if self._pair else digest)
 
     def opened(self, key: str, envelope: bytes | None, payload: bytes) -> Envelope | Flaw:
-        """Return the head of what has come under a key expression, or what is wrong with it, which
-        is counted.
+        """Check a received message and return its head. A flaw is counted.
+
+        Args:
+            key: Key expression under which the message arrived.
+            envelope: Envelope of the message. None if it has none.
+            payload: Content of the message.
+
+        Returns:
+            The head, or the flaw for which the message must be rejected.
         """
         if len(payload) > self._most:
             return self._flawed(Flaw.OVERSIZED)
@@ -107,15 +143,15 @@ class Sealer:
             or envelope[:4] != _MAGIC
         ):
             return self._flawed(Flaw.MALFORMED)
-        _, flags, length, *rest = _HEAD.unpack_from(envelope)
-        end = _HEAD.size + length
+        _, flags, chain_bytes, *fields = _HEAD.unpack_from(envelope)
+        end = _HEAD.size + chain_bytes
         digest = _digest(key, envelope[:end], payload)
         if not self._is_sealed(key, digest, envelope[_HEAD.size : end], envelope[end:]):
             return self._flawed(Flaw.UNSIGNED)
-        return Envelope._make((*rest, flags))
+        return Envelope._make((*fields, flags))
 
     def _is_sealed(self, key: str, digest: bytes, chain: bytes, seal: bytes) -> bool:
-        """Say whether the one in whose name something comes has sealed it."""
+        """Return True if the seal was made by the sender that the key expression names."""
         if self._credentials is None:
             return compare_digest(seal, digest)
         identity = self._credentials.identity(chain)
@@ -126,13 +162,15 @@ class Sealer:
         )
 
     def _flawed(self, flaw: Flaw) -> Flaw:
+        """Count a flaw and return it."""
         self.flaws[flaw] += 1
         return flaw
 
 
 def _digest(key: str, packed: bytes, payload: bytes | memoryview) -> bytes:
-    found = sha256(packed)
-    # With its length: what ends the key and what begins the payload cannot change places.
-    found.update(f"{len(key)}:{key}".encode())
-    found.update(payload)
-    return found.digest()
+    """Return the SHA-256 of head, certificates, key expression and payload."""
+    digest = sha256(packed)
+    # Include the length of the key, so that no bytes can move between key and payload.
+    digest.update(f"{len(key)}:{key}".encode())
+    digest.update(payload)
+    return digest.digest()

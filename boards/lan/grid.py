@@ -1,6 +1,4 @@
-"""The grid of this rack next to those of others: ticks as times on another machine's clock, and the
-other way round.
-"""
+"""Conversion between this rack's ticks and the clocks of other racks."""
 
 from __future__ import annotations
 
@@ -13,10 +11,14 @@ from rack.boards.lan.peers import PeerRack
 
 
 class OwnGrid:
-    """Converts ticks. In lockstep all racks have one simulated time; in real time each has an epoch
-    of its own.
+    """Converts ticks of this rack to times and back.
 
-    `every`: ticks of the adapter's cycle.
+    In lockstep all racks share one simulated time. In real time each rack has its own epoch.
+    `every` is the length of the adapter's cycle in ticks.
+
+    Attributes:
+        is_lockstep: Whether the rack runs in lockstep.
+        tick_s: Length of one tick in simulated time, s.
     """
 
     def __init__(self, segment: Segment, every: int = 1) -> None:
@@ -25,14 +27,17 @@ class OwnGrid:
         self._cycle_ns = every * self._clock_ns
         self.is_lockstep = self._clock.is_lockstep
         self.tick_s = self._clock_ns * 1e-9
-        """One tick, s of simulated time."""
 
     def cycles(self, rate_hz: float) -> int:
-        """Return the period, in cycles of the adapter, of an exchange."""
+        """Return the period of an exchange in cycles of the adapter.
+
+        Raises:
+            ClockError: The rate does not divide the adapter's rate.
+        """
         return ticks_of(rate_hz, self._cycle_ns, "an exchange")
 
     def ticks_in(self, real_ns: float) -> int:
-        """Return the ticks within which that much real time has passed."""
+        """Return the number of ticks after which at least `real_ns` of real time have passed."""
         return ceil(real_ns / self._clock.period_ns)
 
     def time_ns(self, tick: int) -> int:
@@ -40,16 +45,19 @@ class OwnGrid:
         return tick * self._clock_ns
 
     def stamp_ns(self, tick: int) -> int:
-        """Return the CLOCK_MONOTONIC of a tick on this machine, ns; in lockstep its simulated
-        time.
-        """
+        """Return the CLOCK_MONOTONIC of a tick here, ns. In lockstep, its simulated time."""
         return self.time_ns(tick) if self.is_lockstep else self._clock.time_of(tick)
 
     def tick_of(self, head: Envelope, peer: PeerRack, tick: int) -> int:
-        """Return the tick here at which a message was written there, at most `tick`, now.
+        """Convert the time at which another rack wrote a message to a tick of this rack.
 
-        The clocks have been compared. It counts as written as early as the uncertainty of that
-        permits: never as younger than it is.
+        The result is early by the uncertainty of the clock comparison, so a message never counts as
+        younger than it is.
+
+        Args:
+            head: Envelope of the message.
+            peer: The rack that wrote it. In real time its clock offset must be known.
+            tick: Current tick, the upper limit of the result.
         """
         if self.is_lockstep:
             return min(tick, head.time_ns // self._clock_ns)

@@ -1,14 +1,14 @@
-"""Key expressions on the network; R is the name of the rack, or operator, that sends.
+"""Key expressions on the network. R is the name of the rack or operator that sends.
 
-    rack/R/alive/<launch>          liveliness token: gone when the adapter's process ends or is
-                                   silent for the lease; in lockstep its cycle follows,
-                                   ns, after a hyphen
-    rack/R/out/<board>/<port>      an exported mailbox
-    rack/R/step                    lockstep: a cycle of R's adapter, with all that it exports
+    rack/R/alive/<launch>             liveliness token; expires when the adapter's process ends or
+                                      is silent for the lease. In lockstep, a hyphen and the
+                                      length of the adapter's cycle in ns follow.
+    rack/R/out/<board>/<port>         an exported mailbox
+    rack/R/step                       lockstep: one cycle of R's adapter with all its exports
     rack/R/ping/<to>, .../pong/<to>   round trips between clocks
-    rack/R/estop/<to>              a query that sets the emergency stop of rack <to>
+    rack/R/estop/<to>                 a query that sets the emergency stop of rack <to>
 
-All begin with the sender's name, so that access control can hold each sender to its own.
+Every key contains the sender's name, so access control can restrict a sender to its own keys.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ _SENDER = re.compile(r"rack/([^/]+)/")
 
 
 def sender_of(key: str) -> str:
-    """Return the name of the sender under a key expression, or an empty string if it has none."""
-    found = _SENDER.match(key)
-    return found[1] if found else ""
+    """Return the sender's name in a key expression, or an empty string if it has none."""
+    match = _SENDER.match(key)
+    return match[1] if match else ""
 
 
 def out_key(rack: str, mailbox: str) -> str:
@@ -32,51 +32,57 @@ def out_key(rack: str, mailbox: str) -> str:
 
 
 def alive_key(rack: str, launch: int, cycle_ns: int = 0) -> str:
-    """Return the key expression of a launch's token; in lockstep with the length of its adapter's
-    cycle, ns.
+    """Return the key expression of a launch's liveliness token.
+
+    Args:
+        rack: Name of the rack.
+        launch: Number of the launch, at most 64 bits.
+        cycle_ns: Length of the adapter's cycle in lockstep, ns. 0 in real time.
     """
     return f"rack/{rack}/alive/{launch:016x}" + (f"-{cycle_ns}" if cycle_ns else "")
 
 
 def launch_and_cycle(alive: str) -> tuple[int, int] | None:
-    """Return the launch of a token, and the length of its adapter's cycle in ns; 0: it runs in real
-    time.
+    """Parse the key expression of a liveliness token.
 
-    None for a token that no adapter has made.
+    Returns:
+        The launch number and the length of the adapter's cycle in ns, which is 0 in real time. None
+        if no adapter can have declared this token.
     """
-    if (found := _ALIVE.fullmatch(alive)) is None:
+    if (match := _ALIVE.fullmatch(alive)) is None:
         return None
-    launch, cycle_ns = found.groups()
+    launch, cycle_ns = match.groups()
     return int(launch, 16), int(cycle_ns or 0)
 
 
 def any_alive(rack: str) -> str:
-    """Return the key expression of the tokens of all launches of a rack."""
+    """Return the key expression that matches the tokens of all launches of a rack."""
     return f"rack/{rack}/alive/*"
 
 
 def step_key(rack: str) -> str:
-    """Return the key expression of the cycles of a rack's adapter, in lockstep."""
+    """Return the key expression of a rack's steps in lockstep."""
     return f"rack/{rack}/step"
 
 
 def ping_key(rack: str, to: str) -> str:
-    """Return the key expression of a round trip that a rack begins."""
+    """Return the key expression under which a rack pings rack `to`."""
     return f"rack/{rack}/ping/{to}"
 
 
 def pong_key(rack: str, to: str) -> str:
-    """Return the key expression of a round trip that a rack sends back."""
+    """Return the key expression under which a rack answers the pings of rack `to`."""
     return f"rack/{rack}/pong/{to}"
 
 
 def estop_key(sender: str, to: str) -> str:
-    """Return the key expression under which a sender sets the emergency stop of rack `to`."""
+    """Return the key expression under which a sender requests an emergency stop of rack `to`."""
     return f"rack/{sender}/estop/{to}"
 
 
 def estop_answer_key(rack: str, to: str) -> str:
-    """Return the key under which rack `rack` seals its answer, so that no request passes for an
-    answer.
+    """Return the key with which a rack seals its answer to an emergency-stop request.
+
+    It differs from the request's key, so that a request cannot be replayed as an answer.
     """
     return f"rack/{rack}/estop-answer/{to}"

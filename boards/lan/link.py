@@ -1,13 +1,13 @@
-"""The link: a rack's session on the network, with everything that looks for others by itself
-switched off.
+"""Session of a rack on the network. Automatic discovery of other sessions is switched off.
 
-What comes is kept in channels of fixed length, which overwrite the oldest; the adapter takes it in
-its own cycles.
+Received messages wait in channels of fixed length, whose oldest entry is overwritten when they are
+full. The adapter empties them in its cycles.
 
-Strangers who fail their TLS handshake disturb nobody who is connected. But zenoh takes no new
-connection for 0.1 s after each (its issue 2685), and over quic only one handshake at a time (2719).
-A rack that also connects outwards is found all the same: where strangers may come, let each rack
-list the others in `connect`, and let the firewall admit their addresses alone.
+Failed TLS handshakes of strangers do not disturb existing connections. After each failure, however,
+zenoh accepts no new connection for 0.1 s (its issue 2685), and over quic it handles only one
+handshake at a time (2719). A rack that also connects outwards is found nevertheless. In a network
+with strangers, let each rack list the others in `connect`, and let the firewall admit only their
+addresses.
 """
 
 from __future__ import annotations
@@ -32,26 +32,26 @@ if TYPE_CHECKING:
     from rack.boards.lan.credentials import Credentials
 
 UNREAD = 32
-"""Messages of one import that wait for a cycle, at most; a newer one overwrites the oldest."""
+"""Maximum number of messages of one import that wait for a cycle."""
 TOKENS = 1024
-"""Racks that may come or go between two cycles of an adapter."""
+"""Maximum number of liveliness changes between two cycles of an adapter."""
 RETRY_MS = (50, 200)
-"""Shortest and longest time between two attempts to connect."""
+"""Shortest and longest interval between two attempts to connect."""
 KEEP_ALIVES = 4
-"""Signs of life within a lease."""
+"""Number of keep-alive messages within a lease."""
 HANDSHAKE_MS = 3000
-"""Longest time to open a connection."""
+"""Maximum time to open a connection."""
 MOST_STEP = 65_536
-"""Length of the longest step in lockstep, bytes."""
+"""Maximum length of a step in lockstep, bytes."""
 ZENOH_BYTES = 1024
-"""What zenoh adds to the content of a message, at most: key expression, lengths, options."""
+"""Maximum overhead that zenoh adds to a message: key expression, lengths and options."""
 SOCKET = "unixsock-stream"
-"""A Unix socket's protocol, as zenoh calls it."""
+"""Zenoh's name for the protocol of a Unix socket."""
 NO_WAIT = {"messages": ["query"], "flows": ["ingress"], "overwrite": {"congestion_control": "drop"}}
 
 
 class Arrived(NamedTuple):
-    """Something that has come: its key expression, its envelope if it has one, its content."""
+    """A received message: its key expression, its envelope if it has one, and its content."""
 
     key: str
     envelope: bytes | None
@@ -59,14 +59,14 @@ class Arrived(NamedTuple):
 
     @classmethod
     def of(cls, sample: zenoh.Sample) -> Self:
-        """Return what a sample of the network holds."""
+        """Copy a message out of a sample of zenoh."""
         return cls(str(sample.key_expr), _bytes_of(sample.attachment), sample.payload.to_bytes())
 
 
 class Question(NamedTuple):
-    """A query that has come. `reply` sends an answer, a payload and its envelope.
+    """A received query. `reply` sends a payload and its envelope as an answer.
 
-    The asker is done when the next question is taken, or none is left.
+    The query ends when the next question is taken, or when none is left.
     """
 
     asked: Arrived
@@ -74,37 +74,46 @@ class Question(NamedTuple):
 
 
 class LanLink:
-    """One open session of `rack`, or of an operator of that name.
+    """Open session of a rack or an operator.
 
-    Raises `LevelError` if an endpoint cannot be opened, or the credentials cannot be used.
+    Args:
+        rack: Name of the rack or the operator.
+        table: The `[adapter.lan]` table.
+        is_operator: Whether the session belongs to an operator.
+
+    Raises:
+        LevelError: An endpoint cannot be opened, or the credentials cannot be used.
+
+    Attributes:
+        sealer: Seals and opens the messages of this session.
+        session: The session of zenoh.
     """
 
     def __init__(self, rack: str, table: LanTable, is_operator: bool = False) -> None:
         self.rack = rack
         credentials = None
         if table.certificates is not None:
-            # Only here: a rack without certificates does without the package for them.
+            # Imported late: racks without certificates do not need the cryptography package.
             from rack.boards.lan.credentials import Credentials
 
             credentials = Credentials(Path(table.certificates), rack)
         try:
             self.sealer = Sealer(credentials, table.most_bytes)
-            """Seals and opens what this rack sends and receives."""
             self.session = zenoh.open(_settings(rack, table, credentials, is_operator))
         except zenoh.ZError as error:
             why = " ".join(str(error).split())
             raise LevelError(
-                f"adapter.lan: listen {', '.join(table.listen) or 'nowhere'}: {why}"
+                f"adapter.lan: cannot listen on {', '.join(table.listen) or 'no endpoint'}: {why}"
             ) from None
         except Credential as flaw:
             raise LevelError(f"adapter.lan: {flaw}") from None
         self._kept: list[Any] = []
 
     def publish(self, key: str, reliable: bool = False) -> Callable[[bytes, bytes], None]:
-        """Return a function that sends payload and envelope under a key expression, and never
-        waits.
+        """Return a function that sends a payload and its envelope under a key expression.
 
-        `reliable`: it waits for room instead; for lockstep only.
+        It drops the message if there is no room. With `reliable`, which only lockstep uses, it
+        waits for room instead.
         """
         control = zenoh.CongestionControl.BLOCK if reliable else zenoh.CongestionControl.DROP
         publisher = self.session.declare_publisher(
@@ -117,97 +126,110 @@ class LanLink:
     def _channel(
         self, declare: Callable[..., Any], key: str, unread: int, **options: bool
     ) -> Callable[[], Iterator[Any]]:
-        """Declare something whose messages wait in a channel; return a function that yields those
-        that have come since its last call, oldest first.
+        """Open a subscription or a query channel with a bounded buffer.
+
+        Args:
+            declare: Method of the session that declares it.
+            key: Key expression.
+            unread: Length of the buffer.
+            options: Passed on to `declare`.
+
+        Returns:
+            A function that yields the samples since its last call, oldest first.
         """
         channel = declare(key, zenoh.handlers.RingChannel(unread), **options)
         self._kept.append(channel)
 
-        def waiting() -> Iterator[Any]:
-            # No more than may wait: a flood must not keep the cycle.
+        def take_samples() -> Iterator[Any]:
+            # Take at most one buffer's worth, so that a flood cannot prolong the cycle.
+            """Yield the samples in the buffer, oldest first."""
             for _ in range(unread):
-                if (found := channel.try_recv()) is None:
+                if (sample := channel.try_recv()) is None:
                     return
-                yield found
+                yield sample
 
-        return waiting
+        return take_samples
 
     def subscribe(self, key: str) -> Callable[[], Iterator[Arrived]]:
-        """Return a function that yields what has come under a key expression since the last call,
-        oldest first.
-        """
+        """Return a function that yields the new messages under a key expression, oldest first."""
         waiting = self._channel(self.session.declare_subscriber, key, UNREAD)
         return lambda: map(Arrived.of, waiting())
 
     def on(self, key: str, callback: Callable[[Arrived], None]) -> None:
-        """Call a function in a thread of the network with everything that comes under a key
-        expression, at once.
-        """
+        """Call a function for each message under a key expression, in a thread of zenoh."""
 
-        def take(sample: zenoh.Sample) -> None:
+        def pass_sample(sample: zenoh.Sample) -> None:
+            """Pass a sample on as a message."""
             callback(Arrived.of(sample))
 
-        # Direct: a thread between would add its wake-up, and a queue without a bound.
-        handler = zenoh.handlers.Callback(take, indirect=False)
+        # Indirect callbacks would add the wake-up of another thread and an unbounded queue.
+        handler = zenoh.handlers.Callback(pass_sample, indirect=False)
         self._kept.append(self.session.declare_subscriber(key, handler))
 
     def answer(self, key: str, unread: int = UNREAD) -> Callable[[], Iterator[Question]]:
-        """Return a function that yields the questions asked under a key expression since the last
-        call, oldest first.
+        """Return a function that yields the new questions under a key expression, oldest first.
 
-        A question under several keys at once is dropped unanswered.
+        A query with a wildcard in its key is dropped unanswered.
         """
         waiting = self._channel(self.session.declare_queryable, key, unread)
 
-        def questions() -> Iterator[Question]:
+        def take_questions() -> Iterator[Question]:
+            """Yield the questions in the buffer, oldest first."""
             for query in waiting():
                 with query:
                     content = _bytes_of(query.payload) or b""
-                    asked = Arrived(str(query.key_expr), _bytes_of(query.attachment), content)
-                    if "*" not in asked.key:
-                        yield Question(asked, _reply(query))
+                    question = Arrived(str(query.key_expr), _bytes_of(query.attachment), content)
+                    if "*" not in question.key:
+                        yield Question(question, _reply(query))
 
-        return questions
+        return take_questions
 
     def declare_alive(self, launch: int, cycle_ns: int = 0) -> None:
-        """Show others that this launch is there; after everything that they may send it. See
-        `alive_key`.
+        """Declare the liveliness token of this launch.
+
+        Call it last: a rack that sees the token may send at once. In lockstep, `cycle_ns` is the
+        length of the adapter's cycle: see `alive_key`.
         """
         self._kept.append(
             self.session.liveliness().declare_token(alive_key(self.rack, launch, cycle_ns))
         )
 
     def watch_alive(self) -> Callable[[], Iterator[tuple[str, int, bool]]]:
-        """Return a function that yields rack, launch, and whether it has come or gone, of others,
-        oldest first.
+        """Return a function that yields the changes of other racks' tokens since its last call.
+
+        It yields the rack, its launch, and True if the token has appeared or False if it has gone.
         """
         declare = self.session.liveliness().declare_subscriber
         waiting = self._channel(declare, ALL_ALIVE, TOKENS, history=True)
 
-        def changes() -> Iterator[tuple[str, int, bool]]:
+        def take_changes() -> Iterator[tuple[str, int, bool]]:
+            """Yield the changes in the buffer, oldest first."""
             for sample in waiting():
                 key = str(sample.key_expr)
-                if (found := launch_and_cycle(key)) is not None:
-                    yield key.split("/")[1], found[0], sample.kind == zenoh.SampleKind.PUT
+                if (parsed := launch_and_cycle(key)) is not None:
+                    yield key.split("/")[1], parsed[0], sample.kind == zenoh.SampleKind.PUT
 
-        return changes
+        return take_changes
 
     def close(self) -> None:
-        """Leave the network: others see it at once."""
+        """Close the session. Other racks notice it at once."""
         self.session.close()  # type: ignore[no-untyped-call]
 
 
 def _bytes_of(content: zenoh.ZBytes | None) -> bytes | None:
+    """Return the bytes of a payload or an attachment, if there is one."""
     return None if content is None else content.to_bytes()
 
 
 def _reply(query: zenoh.Query) -> Callable[[bytes, bytes], None]:
+    """Return a function that answers a query under the query's own key."""
     return lambda payload, envelope: query.reply(query.key_expr, payload, attachment=envelope)
 
 
 def _settings(
     rack: str, table: LanTable, credentials: Credentials | None, is_operator: bool
 ) -> zenoh.Config:
+    """Return the configuration of zenoh for a session."""
     timed = f"#tls_handshake_timeout_ms={HANDSHAKE_MS}" if has_tls(table) else ""
     shortest, longest = RETRY_MS
     protocols = {
@@ -215,8 +237,7 @@ def _settings(
     }
     settings: dict[str, Any] = {
         "mode": "peer",
-        # Nothing looks for others, or answers those who do. What zenoh keeps in shared memory it
-        # leaves there.
+        # Disable discovery. Disable shared memory, because zenoh leaves its segments behind.
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
         "transport/shared_memory/enabled": False,
@@ -225,7 +246,7 @@ def _settings(
         "connect/endpoints": list(map(_locator, table.connect)),
         "connect/timeout_ms": -1,
         "connect/exit_on_failure": False,
-        # A peer that is not there yet keeps nobody: opening would wait for it for half a second.
+        # Do not wait for peers: opening would otherwise block for half a second for each.
         "open/return_conditions/connect_scouted": False,
         "connect/retry": {
             "period_init_ms": shortest,
@@ -234,7 +255,7 @@ def _settings(
         },
         "access_control": access_control(rack, table, is_operator),
         "transport/link/protocols": sorted(protocols) or ["tcp"],
-        # Whoever opens a connection and says no more is forgotten; these many at once are borne.
+        # Drop connections that are opened but never used.
         "transport/unicast/accept_timeout": HANDSHAKE_MS,
         "transport/unicast/open_timeout": HANDSHAKE_MS,
         "transport/link/rx/max_message_size": (
@@ -243,23 +264,25 @@ def _settings(
         "transport/link/tx/lease": round(table.lease_ms),
         "transport/link/tx/keep_alive": KEEP_ALIVES,
         "transport/link/tx/queue/size/real_time": 16,
-        # An answer takes over the congestion control of its question: whoever asks must not make
-        # the adapter wait.
+        # An answer inherits the congestion control of its question, which must not make the
+        # adapter wait.
         "qos/network": [NO_WAIT],
-        # What does wait for room, in lockstep, waits no longer than until the peer counts as lost.
+        # In lockstep, sending waits for room, but not longer than until the peer counts as lost.
         "transport/link/tx/queue/congestion_control/block/wait_before_close": round(
             table.lease_ms * 1e3
         ),
     }
     if credentials is not None and has_tls(table):
-        own = {"certificate": str(credentials.certificate), "private_key": str(credentials.key)}
+        paths = {"certificate": str(credentials.certificate), "private_key": str(credentials.key)}
         settings["transport/link/tls"] = {
             "root_ca_certificate": str(credentials.authority),
             "enable_mtls": True,
             "verify_name_on_connect": True,
             "close_link_on_expiration": True,
             **{
-                f"{side}_{key}": path for side in ("listen", "connect") for key, path in own.items()
+                f"{side}_{key}": path
+                for side in ("listen", "connect")
+                for key, path in paths.items()
             },
         }
     config = zenoh.Config()
@@ -269,8 +292,10 @@ def _settings(
 
 
 def _locator(text: str) -> str:
-    """Return an endpoint as zenoh knows it. Raises `LevelError`: others may enter the folder of
-    this user's sockets.
+    """Return an endpoint in zenoh's notation, and create the folder for this user's sockets.
+
+    Raises:
+        LevelError: The folder cannot be made, or users other than this one can access it.
     """
     endpoint = Endpoint.of(text)
     if not endpoint.is_private:
@@ -278,16 +303,16 @@ def _locator(text: str) -> str:
     folder = Path(os.environ.get("XDG_RUNTIME_DIR") or "/tmp") / f"rack-{os.getuid()}"
     try:
         folder.mkdir(mode=0o700, exist_ok=True)
-        about = folder.lstat()
+        status = folder.lstat()
     except OSError as error:
         raise LevelError(f"adapter.lan: {folder}: {error.strerror}") from None
     if (
-        not stat.S_ISDIR(about.st_mode)
-        or about.st_uid != os.getuid()
-        or about.st_mode & (stat.S_IRWXG | stat.S_IRWXO)
+        not stat.S_ISDIR(status.st_mode)
+        or status.st_uid != os.getuid()
+        or status.st_mode & (stat.S_IRWXG | stat.S_IRWXO)
     ):
         raise LevelError(
-            f"adapter.lan: {folder}: others may enter it; permitted: a folder of this user, mode"
-            " 0700"
+            f"adapter.lan: {folder}: others can access it; it must be a folder of this user with"
+            " mode 0700"
         )
     return f"{SOCKET}/{folder / endpoint.host}"

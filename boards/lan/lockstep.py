@@ -1,21 +1,20 @@
-"""Racks in lockstep step as one: each cycle of an adapter ends when those of all racks that work
-together have begun.
+"""Lockstep of several racks: a cycle of an adapter ends when that cycle has begun in all racks.
 
-In the cycle released at simulated time t an adapter sends its step: the time t, and everything that
-its rack exports then. It waits for the step of t from every other rack, then passes on what they
-have exported up to t. As a message becomes visible at the end of its cycle, nobody needs more, and
-the imports depend on ticks alone. No clock gets further ahead of another than two of these cycles,
-and while one is held, all are.
+In the cycle released at simulated time t, an adapter sends its step: the time t and everything that
+its rack exports in this cycle. It waits for the step of time t from every other rack, then delivers
+what they have exported up to t. A message becomes visible at the end of its cycle, so nobody needs
+a later step, and the imports depend on ticks alone. No clock can be more than two of these cycles
+ahead of another. If one rack is held, all are.
 
-Exports travel in the step: a cycle costs one message, and nothing depends on the order of several.
-Alternatives considered: a mark after the exports (each costs a message, and the network keeps order
-within one key only), a barrier in the clock at every tick (the clock would wait for the network
-even where no message is due; an adapter at the rate of the clock comes to the same), and one rack
-that steps the others (one more process on which all depend).
+Exports travel within the step. A cycle therefore costs one message, and the order of messages does
+not matter. Alternatives considered: a mark after the exports (each export costs a message, and the
+network keeps the order only within one key), a barrier in the clock at every tick (the clock would
+wait for the network even if no message is due; an adapter at the rate of the clock has the same
+effect), and one rack that steps the others (one more process on which all depend).
 
-A step that somebody could not receive is sent again: to a rack that comes, and to an adapter that
-sends its first. A rack whose adapter dies is awaited, since its board may be restarted; one that
-ends says so, and is lost from the next cycle on.
+A step that somebody may have missed is sent again: to a rack that appears, and to an adapter that
+sends its first step. A rack whose adapter has died is awaited, because its board may be restarted.
+A rack that ends says so, and counts as lost from the next cycle on.
 """
 
 from __future__ import annotations
@@ -42,19 +41,24 @@ from rack.levels.errors import CannotGoOn
 
 STEP_KIND = xxh3(b"rack step 2")
 _CONTENT: Any = tuple[Int64, list[str], list[tuple[str, bytes, bytes]]]
-"""Length of the cycle, racks, and of each export the key, the envelope and the payload."""
+"""Length of the cycle in ns, racks, and key, envelope and payload of each export."""
 
 
 class StepFlag(IntFlag):
-    """What else a step says, in the flags of its envelope."""
+    """Flags in the envelope of a step."""
 
-    FIRST = 1  # this process needs the newest step of the others
-    OVER = 2  # the run has ended, and this was its last step
+    FIRST = 1  # the sender has just started and needs the newest step of the others
+    OVER = 2  # the sender's run has ended with this step
 
 
 class Step(NamedTuple):
-    """One step of a rack. `cycle_ns`: length of its adapter's cycle; `racks`: those for which it
-    waits.
+    """One step of a rack.
+
+    Attributes:
+        head: Envelope of the step.
+        cycle_ns: Length of the adapter's cycle in simulated time, ns.
+        racks: Racks for which the sender waits.
+        exports: Messages that the sender exports in this cycle.
     """
 
     head: Envelope
@@ -64,36 +68,50 @@ class Step(NamedTuple):
 
 
 def pack_step(cycle_ns: int, racks: Iterable[str], exports: Sequence[Arrived]) -> bytes:
-    """Return the content of a step."""
+    """Serialise a step.
+
+    Args:
+        cycle_ns: Length of the adapter's cycle in simulated time, ns.
+        racks: Racks for which the sender waits.
+        exports: Messages to export.
+    """
     parts = [(export.key, export.envelope or b"", export.payload) for export in exports]
     return z_serialize((Int64(cycle_ns), list(racks), parts)).to_bytes()
 
 
 def unpack_step(head: Envelope, content: bytes) -> Step | None:
-    """Return the step with this head; None if it is no step, or malformed."""
+    """Parse the content of a step. Return None if it is malformed or not a step."""
     if head.kind != STEP_KIND:
         return None
     try:
-        cycle_ns, racks, parts = z_deserialize(_CONTENT, zenoh.ZBytes(content))
+        cycle_ns, racks, export_tuples = z_deserialize(_CONTENT, zenoh.ZBytes(content))
     except ZDeserializeError:
         return None
-    exports = [Arrived(*part) for part in parts]
-    # What is left behind the last part would be ignored.
+    exports = [Arrived(*export) for export in export_tuples]
+    # The deserialiser ignores trailing bytes, so compare with what the step packs to.
     if pack_step(cycle_ns, racks, exports) != content:
         return None
     return Step(head, cycle_ns, racks, exports)
 
 
 LOOK_S = 0.1
-"""Time between two looks at the end of the run, while a rack is awaited."""
+"""Interval at which a waiting adapter checks for the end of the run and for lost racks."""
 NEVER = -1
 
 
 class Partner:
-    """A rack that steps with this one.
+    """State of a rack that runs in lockstep with this one.
 
-    `launch` is that of its steps, `time_ns` the simulated time of the newest; `steps` are not
-    passed on yet. Nothing more comes of one that `is_out`.
+    Attributes:
+        rack: Name of the rack.
+        place: Index of the rack in `LanTable.racks`.
+        launch: Launch of its steps.
+        time_ns: Simulated time of its newest step, ns. `NEVER` if none has arrived.
+        steps: Steps that are not yet delivered.
+        is_out: Whether it no longer takes part, so that nobody waits for it.
+        is_there: Whether it was present in the last cycle.
+        gone_s: CLOCK_MONOTONIC at which its adapter was found gone, s. None if the adapter is
+            present or was never seen.
     """
 
     def __init__(self, rack: str, place: int) -> None:
@@ -102,30 +120,29 @@ class Partner:
         self.forget()
 
     def forget(self) -> None:
-        """Await it anew."""
+        """Return to the initial state, in which the rack is awaited."""
         self.launch = NONE
         self.time_ns = NEVER
         self.steps: deque[Step] = deque()
         self.is_out = self.is_there = False
         self.gone_s: float | None = None
-        """CLOCK_MONOTONIC at which it was found gone; None: it is there, or has not come yet."""
 
     @property
     def word(self) -> int:
-        """The word that says it is awaited."""
-        seen = Why.UNSEEN if self.launch == NONE else Why.SLOWER
-        return word_of(self.place, seen if self.gone_s is None else Why.GONE)
+        """Code for `Block.AWAITS` that says that this rack is awaited, and why."""
+        why = Why.UNSEEN if self.launch == NONE else Why.SLOWER
+        return word_of(self.place, why if self.gone_s is None else Why.GONE)
 
     def is_gone_for(self, time_s: float) -> bool:
-        """Return True if it has been gone for longer than that."""
+        """Return True if its adapter has been gone for longer than `time_s`, s."""
         return self.gone_s is not None and time.monotonic() - self.gone_s > time_s
 
     def has_reached(self, now_ns: int) -> bool:
-        """Say whether nothing more comes of it up to this time."""
+        """Return True if no further step up to this simulated time is to be expected from it."""
         return self.time_ns >= now_ns or self.is_out
 
     def take(self, step: Step) -> None:
-        """Note a step, which may have come before."""
+        """Record a step. One that is not newer is not delivered again."""
         self.gone_s = None
         if step.head.time_ns > self.time_ns:
             self.time_ns = step.head.time_ns
@@ -133,21 +150,33 @@ class Partner:
         self.is_out = bool(step.head.flags & StepFlag.OVER)
 
     def passed(self, now_ns: int) -> Iterator[Step]:
-        """Yield its steps up to this time, once."""
+        """Remove and yield the steps up to this simulated time."""
         while self.steps and self.steps[0].head.time_ns <= now_ns:
             yield self.steps.popleft()
 
 
 class Barrier:
-    """The end of an adapter's cycles, common to all racks in lockstep.
+    """Exchanges the steps of all racks in lockstep at the end of each cycle.
 
-    Exports and imports use it in place of the `LanLink`, with the same methods.
+    Exports and imports use it in place of `LanLink`; it has the same methods.
+
+    Attributes:
+        cycle_ns: Length of the adapter's cycle in simulated time, ns. Must be equal in all racks.
+        done: Release of the last cycle that the previous adapter finished, a tick. -1 if there was
+            none.
     """
 
     def __init__(
         self, segment: Segment, board: str, racks: Iterable[str], lost: Iterable[str]
     ) -> None:
-        """Step with `racks`, except those that an adapter before this one has `lost`."""
+        """Create the barrier of an adapter.
+
+        Args:
+            segment: Segment of the rack.
+            board: Board of the adapter.
+            racks: Racks with which to run in lockstep.
+            lost: Those that the previous adapter has already lost. They take no part.
+        """
         self._segment = segment
         self._block = segment.block(board)
         self._partners = {rack: Partner(rack, place) for place, rack in enumerate(racks)}
@@ -155,11 +184,9 @@ class Barrier:
             self._partners[rack].is_out = True
         self._tick_ns = segment.layout.clock_ns
         self.cycle_ns = segment.layout.task(board).every * self._tick_ns
-        """Length of the adapter's cycle, ns of simulated time; equal in all racks."""
         self.done = self._block[Block.DONE]
-        """Last cycle that an adapter before this one has finished, a tick; -1: none."""
         self._is_restarted = self.done >= 0
-        # What has been passed on does not come again.
+        # Exports up to this time were delivered before the restart and are not delivered again.
         self._passed_ns = self.done * self._tick_ns if self._is_restarted else NEVER
         self._is_first = True
         self._has_begun = self._is_restarted
@@ -168,7 +195,7 @@ class Barrier:
         self._exports: list[Arrived] = []
         self._imports: dict[str, deque[Arrived]] = {}
         self._changes: list[tuple[str, int, bool]] = []
-        # A rack is one step ahead of what another has received, at most.
+        # Another rack can lack the newest two steps at most.
         self._steps: deque[tuple[int, bytes]] = deque(maxlen=2)
         self._now_ns = NEVER
         self._sent = 0
@@ -176,56 +203,61 @@ class Barrier:
         self._kept: list[object] = []
 
     def open(self, link: LanLink, launch: int) -> None:
-        """Listen to the others. Call it before this launch shows that it is there."""
+        """Start to receive steps. Call it before the token of this launch is declared."""
         self._rack = link.rack
         self._launch = launch
         self._sealer = link.sealer.taking(MOST_STEP)
         self._key = step_key(link.rack)
         self._put = link.publish(self._key, reliable=True)
-        # Called by a thread of the network: it wakes the cycle that waits, and does no more.
+        # Called in a thread of zenoh: it only wakes the waiting cycle.
         handler = zenoh.handlers.Callback(self._events.put, indirect=False)
         for partner in self._partners.values():
             self._kept.append(link.session.declare_subscriber(step_key(partner.rack), handler))
             if self._is_restarted:
-                # It may have ended meanwhile.
+                # It may have ended while this adapter was restarted.
                 partner.gone_s = time.monotonic()
         self._kept.append(
             link.session.liveliness().declare_subscriber(ALL_ALIVE, handler, history=True)
         )
 
     def publish(self, key: str) -> Callable[[bytes, bytes], None]:
-        """Return a function that sends payload and envelope under a key expression, in the step of
-        this cycle.
-        """
+        """Return a function that adds a payload and its envelope to the step of this cycle."""
         return lambda payload, envelope: self._exports.append(Arrived(key, envelope, payload))
 
     def subscribe(self, key: str) -> Callable[[], Iterator[Arrived]]:
-        """Return a function that yields what others have sent under a key expression up to this
-        cycle, once.
-        """
+        """Return a function that yields the messages under a key up to this cycle, each once."""
         waiting = self._imports.setdefault(key, deque())
         return lambda: (waiting.popleft() for _ in range(len(waiting)))
 
     def changes(self) -> Iterator[tuple[str, int, bool]]:
-        """Yield rack, launch, and whether it has come or gone, since the last call."""
+        """Yield rack, launch and presence for each change of presence since the last call."""
         changes = self._changes
         self._changes = []
         yield from changes
 
     def prepare(self, tick: int) -> None:
-        """Make a step of what was published since the last one."""
+        """Pack the exports since the last step into the step of this cycle.
+
+        Raises:
+            CannotGoOn: The step is too long.
+        """
         awaited = [partner.rack for partner in self._partners.values() if not partner.is_out]
         content = pack_step(self.cycle_ns, awaited, self._exports)
         self._exports = []
         if len(content) > MOST_STEP:
-            self._refuse(f"a cycle exports {len(content)} bytes; lockstep permits {MOST_STEP}")
+            self._refuse(
+                f"a cycle exports {len(content)} bytes; in lockstep at most {MOST_STEP} are allowed"
+            )
         self._steps.append((tick * self._tick_ns, content))
 
     def meet(self, tick: int) -> bool:
-        """Send the step of this cycle, and wait for those of all others; return False if the run is
-        over.
+        """Send the step of this cycle and wait for the steps of all other racks.
 
-        Raises `CannotGoOn` if a rack cannot step with this one.
+        Returns:
+            False if the run ended during the wait.
+
+        Raises:
+            CannotGoOn: Another rack cannot run in lockstep with this one.
         """
         self._now_ns = now_ns = tick * self._tick_ns
         self.prepare(tick)
@@ -233,7 +265,7 @@ class Barrier:
             self._send_again(StepFlag.FIRST)
         else:
             self._send(*self._steps[-1], StepFlag(0))
-        while late := [
+        while late_partners := [
             partner for partner in self._partners.values() if not partner.has_reached(now_ns)
         ]:
             try:
@@ -241,10 +273,10 @@ class Barrier:
             except Empty:
                 if self._is_over:
                     return False
-                # Show for whom we wait, and give up one who is gone for too long.
-                first = late[0]
-                self._block[Block.AWAITS] = first.word
-                first.is_out |= first.is_gone_for(GIVE_UP_S)
+                # Show which rack is awaited, and give it up if its adapter is gone for too long.
+                awaited = late_partners[0]
+                self._block[Block.AWAITS] = awaited.word
+                awaited.is_out |= awaited.is_gone_for(GIVE_UP_S)
         self._block[Block.AWAITS] = 0
         for partner in self._partners.values():
             self._pass_on(partner)
@@ -253,13 +285,15 @@ class Barrier:
         return True
 
     def close(self) -> None:
-        """Let the others go on without this rack, if its run has ended: a board alone may come
-        back.
+        """Tell the other racks to continue without this one if its run has ended.
+
+        Nothing is sent if only this board ends, because it may be restarted.
         """
         if self._steps and (self._is_over or self._has_refused):
             self._send(*self._steps[-1], StepFlag.OVER | self._first)
 
     def _send(self, time_ns: int, content: bytes, flags: StepFlag) -> None:
+        """Send a step with these flags."""
         self._sent += 1
         tick = time_ns // self._tick_ns
         head = Envelope(
@@ -268,27 +302,29 @@ class Barrier:
         self._put(content, self._sealer.seal(self._key, head, content))
 
     def _send_again(self, flags: StepFlag) -> None:
-        """Send the newest steps to somebody who may not have received them; others ignore them."""
+        """Repeat the newest steps for a rack that may have missed them. Others ignore them."""
         for time_ns, content in self._steps:
             self._send(time_ns, content, flags)
 
     @property
     def _first(self) -> StepFlag:
+        """`FIRST` until the first exchange is over, else no flag."""
         return StepFlag.FIRST if self._is_first else StepFlag(0)
 
     @property
     def _is_over(self) -> bool:
+        """Whether the run is over or was asked to stop."""
         return bool(self._segment.words[System.STOP_REQUEST]) or self._segment.run_is_over
 
     def _note(self, sample: zenoh.Sample) -> None:
-        """Note what has come: a step of another rack, or the sign that it is there or gone."""
+        """Process a received sample, which is a step or a change of a liveliness token."""
         key = str(sample.key_expr)
         partner = self._partners.get(key.split("/")[1])
         if partner is None or partner.is_out:
             return
         if key != step_key(partner.rack):
-            if (found := launch_and_cycle(key)) is not None:
-                self._note_sign(partner, *found, sample.kind == zenoh.SampleKind.PUT)
+            if (parsed := launch_and_cycle(key)) is not None:
+                self._note_sign(partner, *parsed, sample.kind == zenoh.SampleKind.PUT)
             return
         arrived = Arrived.of(sample)
         head = self._sealer.opened(*arrived)
@@ -297,10 +333,11 @@ class Barrier:
             self._note_step(partner, step)
 
     def _note_sign(self, partner: Partner, launch: int, cycle_ns: int, is_there: bool) -> None:
+        """Process a change of another rack's liveliness token."""
         if is_there and partner.launch in (NONE, launch):
             self._check_cycle(partner, cycle_ns)
             partner.gone_s = None
-            # It has come, or come back: what was sent meanwhile is lost.
+            # It has just appeared, so it has missed the steps that were sent before.
             self._send_again(self._first)
         elif is_there:
             self._is_of(partner, launch)
@@ -310,31 +347,33 @@ class Barrier:
                 partner.forget()
 
     def _note_step(self, partner: Partner, step: Step) -> None:
+        """Process a step of another rack. Refuse lockstep if the racks do not fit together."""
         self._check_cycle(partner, step.cycle_ns)
         flags = step.head.flags
         if not flags & StepFlag.OVER and self._rack not in step.racks:
             self._refuse(
                 f"rack '{partner.rack}' does not wait for '{self._rack}' in lockstep: name it in"
-                " adapter.lan.peers there, and start all racks anew"
+                " adapter.lan.peers there, and restart all racks"
             )
         time_ns = step.head.time_ns
         if not self._has_begun and partner.time_ns == NEVER and time_ns > self._now_ns:
             self._refuse(
-                f"rack '{partner.rack}' is at {time_ns * 1e-9:g} s already: racks in lockstep"
-                " begin together, start all anew"
+                f"rack '{partner.rack}' is already at {time_ns * 1e-9:g} s: racks in lockstep"
+                " must begin together; restart all racks"
             )
         partner.take(step)
         if partner.is_out and flags & StepFlag.FIRST and not self._has_begun:
-            # Neither has begun: it may be started again.
+            # Neither run has begun, so the other rack may be started again.
             partner.forget()
         elif flags & StepFlag.FIRST:
-            # Before this rack goes on: it may come too late for the other one to have received its
-            # step.
+            # The other rack may have started too late to receive the step of this cycle. Repeat it
+            # before this rack continues.
             self._send_again(StepFlag(0))
 
     def _is_of(self, partner: Partner, launch: int) -> bool:
-        """Say whether a launch is the one that steps with this rack; one that comes later takes no
-        part.
+        """Return True if a launch is the one that runs in lockstep with this rack.
+
+        Once the run has begun, a second launch of a rack takes no part, and the first one is over.
         """
         if partner.launch != launch:
             if self._has_begun and partner.launch != NONE:
@@ -345,22 +384,24 @@ class Barrier:
         return True
 
     def _check_cycle(self, partner: Partner, cycle_ns: int) -> None:
+        """Refuse lockstep if the other rack runs in real time or has another cycle."""
         if not cycle_ns:
             self._refuse(f"rack '{partner.rack}' runs in real time, this one in lockstep")
         if cycle_ns != self.cycle_ns:
             self._refuse(
                 f"cycles of adapter.lan differ: {cycle_ns * 1e-6:g} ms in rack '{partner.rack}', "
-                f"{self.cycle_ns * 1e-6:g} ms here; lockstep needs equal ones"
+                f"{self.cycle_ns * 1e-6:g} ms in this rack; they must be equal in lockstep"
             )
 
     def _refuse(self, why: str) -> NoReturn:
+        """Raise `CannotGoOn`, which ends this board, with the reason why lockstep is impossible."""
         self._has_refused = True
         raise CannotGoOn(why)
 
     def _pass_on(self, partner: Partner) -> None:
-        """Pass on what a rack has exported up to now, and whether it is there."""
+        """Deliver the exports of a rack up to this cycle, and record a change of its presence."""
         for step in partner.passed(self._now_ns):
-            # What comes once more after a restart was passed on before it.
+            # After a restart, steps arrive again that were delivered before it.
             for export in step.exports if step.head.time_ns > self._passed_ns else ():
                 if export.key.split("/")[1] == partner.rack and export.key in self._imports:
                     self._imports[export.key].append(export)

@@ -1,16 +1,17 @@
-"""The other racks, as an adapter sees them: there or lost, and which launch.
+"""Presence of the other racks as an adapter sees it: present or lost, and in which launch.
 
-Each launch of a rack has a number, which its liveliness token and all its messages carry. Tokens
-come and go in any order: the token of a restarted rack may come before that of its last launch has
-expired, and both may be there when this adapter itself has just joined. So:
+Each launch of a rack has a number, which is contained in its liveliness token and in all its
+messages. Tokens may appear and expire in any order. The token of a restarted rack may appear before
+the token of its previous launch has expired, and an adapter that has just joined may find both.
+Therefore:
 
-- A launch whose token comes is the one that is there. If another was, that one is lost.
-- When its token goes and another one is there, that launch is there; otherwise the rack is lost.
-- A launch that another has replaced, and whose token has gone, is over: no late token or message
-  brings it back.
+- A new token makes its launch the present one. If another launch was present, that one is lost.
+- When the token of the present launch expires and another token remains, the launch of that token
+  becomes the present one. If none remains, the rack is lost.
+- A launch that was replaced and whose token has expired is superseded. Late tokens or messages
+  cannot bring it back.
 
-In lockstep nothing here follows from when a token comes: the barrier says, cycle by cycle, who is
-there.
+In lockstep, tokens do not matter: the barrier decides in each cycle which racks are present.
 """
 
 from __future__ import annotations
@@ -26,33 +27,41 @@ from rack.levels.peer import PeerPresence, Presence
 
 NONE = 0
 REMEMBERED = 16
-"""Launches of one rack that are remembered, and tokens of one rack that are followed at a time, at
-most."""
+"""Maximum number of launches remembered, and of tokens tracked, for each rack."""
 Changes = Callable[[], Iterator[tuple[str, int, bool]]]
 
 
 @dataclass
 class PeerRack:
-    """One other rack. `launch`: number of the launch that is there, or was last; 0: none was. Times
-    are ticks.
+    """State of one other rack.
 
-    `tokens` are the launches whose tokens are there, oldest first. `confirm_by`: of a rack that was
-    there when an adapter before this one ended, until when its token must have come; -1: it has.
+    Attributes:
+        rack: Name of the rack.
+        number: Index of the rack, by which alarms name it.
+        keeps_messages: Whether levels keep the rack's last messages while it is lost.
+        presence: Whether the rack is awaited, present or lost.
+        launch: Number of the launch that is present or was last present. 0 if there was none.
+        launches: Number of different launches seen.
+        losses: How often the rack was lost.
+        since: Tick of the last change of presence.
+        offset_ns: Its CLOCK_MONOTONIC minus the one of this machine, ns. None if not yet measured.
+        uncertainty_ns: Largest error of `offset_ns`, ns.
+        tokens: Launches whose tokens exist, oldest first.
+        confirm_by: Tick by which the token must appear, if the rack was present when this adapter
+            was restarted. -1 if nothing is to be confirmed.
+        findings: Findings that are not yet reported.
     """
 
     rack: str
     number: int = 0
     goes_on: bool = False
-    """Whether levels keep its last messages while it is lost."""
     presence: Presence = Presence.AWAITED
     launch: int = NONE
     launches: int = 0
     losses: int = 0
     since: int = 0
     offset_ns: int | None = None
-    """Its CLOCK_MONOTONIC less that of this machine; None: not measured yet."""
     uncertainty_ns: int = 0
-    """Largest error of that."""
     tokens: list[int] = field(default_factory=list)
     confirm_by: int = -1
     findings: list[Finding] = field(default_factory=list)
@@ -61,28 +70,28 @@ class PeerRack:
 
     @property
     def is_there(self) -> bool:
-        """Whether it is there."""
+        """Whether the rack is present."""
         return self.presence is Presence.THERE
 
     def is_over(self, launch: int) -> bool:
-        """Say whether another launch has replaced this one for good."""
+        """Return True if another launch has replaced this one and its token has expired."""
         return launch in self._over
 
     def comes(self, launch: int, tick: int) -> None:
-        """Note that the token of a launch is there."""
+        """Record that the liveliness token of a launch has appeared."""
         if launch in self._over or (launch not in self.tokens and len(self.tokens) == REMEMBERED):
             return
         if launch not in self.tokens:
             self.tokens.append(launch)
         if self.is_there and self.launch in (NONE, launch):
-            # Without a number it was resumed in lockstep, where launches are not on record.
+            # The launch is unknown if the state was restored from lockstep, which records none.
             self.launch = launch
             self.confirm_by = -1
         else:
             self._enters(launch, tick)
 
     def goes(self, launch: int, tick: int) -> None:
-        """Note that the token of a launch is gone."""
+        """Record that the liveliness token of a launch has expired."""
         if launch in self.tokens:
             self.tokens.remove(launch)
         elif launch != self.launch:
@@ -95,7 +104,7 @@ class PeerRack:
             self.leaves(tick)
 
     def leaves(self, tick: int) -> None:
-        """Note that it is lost."""
+        """Mark the rack as lost. Has no effect if it is not present."""
         if self.is_there:
             self.presence = Presence.LOST
             self.since = tick
@@ -105,7 +114,7 @@ class PeerRack:
             self.findings.append(Finding(Alarm.PEER_LOST, self.number))
 
     def _enters(self, launch: int, tick: int) -> None:
-        """Note that a launch is there that was not, or not any more."""
+        """Make a launch the present one and note whether the rack was restarted or has returned."""
         self.leaves(tick)
         if launch != self.launch:
             self.offset_ns = None
@@ -124,7 +133,9 @@ class PeerRack:
         self.confirm_by = -1
 
     def joins(self, launch: int, tick: int) -> None:
-        """Note, in lockstep, that it is there: from the start, or still when this adapter has been
+        """Mark the rack as present in lockstep.
+
+        The rack joins at the start of the run, or is still present when this adapter has been
         restarted.
         """
         if self.presence is Presence.AWAITED:
@@ -135,8 +146,11 @@ class PeerRack:
         self.confirm_by = -1
 
     def resume(self, message: PeerPresence | AnyMessage, confirm_by: int) -> None:
-        """Continue from the message that an adapter before this one wrote: see
-        `rack.levels.peer.PeerPresence`.
+        """Restore the state that the adapter wrote before it was restarted.
+
+        Args:
+            message: Last `rack.levels.peer.PeerPresence` that the previous adapter wrote.
+            confirm_by: Tick by which a rack that was present must show its token again.
         """
         self.presence = Presence(message.presence)
         self.launch = message.launch
@@ -148,7 +162,10 @@ class PeerRack:
             self._seen.append(self.launch)
 
     def fill(self, message: PeerPresence, is_lockstep: bool) -> None:
-        """Write what is known into its message; launch numbers differ from run to run."""
+        """Write the presence of the rack into its message.
+
+        The launch is left out in lockstep, because launch numbers differ from run to run.
+        """
         message.presence = self.presence
         message.launch = NONE if is_lockstep else self.launch
         message.launches = self.launches
@@ -157,9 +174,10 @@ class PeerRack:
 
 
 class Peers:
-    """All racks with which this one works, by name; others that show up are no peers.
+    """The racks with which this rack works, by name. Other racks on the network are ignored.
 
-    `arrivals` counts the tokens that have come, of any rack.
+    Attributes:
+        arrivals: Number of tokens that have appeared, of any rack.
     """
 
     def __init__(self, racks: Iterable[str], go_on: bool = False) -> None:
@@ -169,14 +187,18 @@ class Peers:
         self.arrivals = 0
 
     def watch(self, changes: Changes, is_lockstep: bool = False) -> None:
-        """Take what comes and goes from now on from this function: rack, launch, whether it has
-        come.
+        """Set the function from which changes of presence are read.
+
+        Args:
+            changes: Yields, for each change since its last call, the rack, its launch, and True if
+                it has appeared or False if it has gone.
+            is_lockstep: Whether the changes come from a barrier instead of liveliness tokens.
         """
         self._changes = changes
         self._is_lockstep = is_lockstep
 
     def look(self, tick: int) -> list[Finding]:
-        """Note who has come and who has gone; return what to report of it."""
+        """Process the changes of presence since the last call and return the resulting findings."""
         for rack, launch, is_there in self._changes():
             self.arrivals += is_there
             peer = self._peers.get(rack)
@@ -188,18 +210,18 @@ class Peers:
                 peer.joins(launch, tick)
             else:
                 peer.leaves(tick)
-        found: list[Finding] = []
+        findings: list[Finding] = []
         for peer in self:
             if 0 <= peer.confirm_by <= tick:
                 peer.leaves(tick)
             if peer.findings:
-                found += peer.findings
+                findings += peer.findings
                 peer.findings.clear()
-        return found
+        return findings
 
     @property
     def lost(self) -> list[str]:
-        """The racks that were there and are lost."""
+        """Names of the racks that were present and are now lost."""
         return [peer.rack for peer in self if peer.presence is Presence.LOST]
 
     def __getitem__(self, rack: str) -> PeerRack:

@@ -1,9 +1,8 @@
-"""The desk of a rack's network adapter: it sets the emergency stop when another machine asks for
-it, in the adapter's cycles.
+"""Emergency stop of a rack on request of other machines, carried out in the adapter's cycles.
 
-Those named in `adapter.lan.estop_from` may ask. What is malformed, unsigned or comes from anybody
-else gets no answer. A cycle looks at a bounded number of requests; newer ones overwrite the rest,
-and whoever gets no answer asks again.
+Only senders named in `adapter.lan.estop_from` may request it. Requests that are malformed, unsigned
+or from anybody else get no answer. Each cycle processes a bounded number of requests. Newer
+requests overwrite the rest, and a sender without an answer asks again.
 """
 
 from __future__ import annotations
@@ -26,18 +25,29 @@ from rack.levels.level import Finding
 
 ESTOP_KIND = xxh3(b"rack estop 1")
 CHECK = 1
-"""Flags of a request that is answered as a stop would be, and sets none."""
+"""Flag of a request that is answered like a stop but sets none."""
 REQUESTS_A_CYCLE = 16
-"""Requests that wait for a cycle, and that a cycle looks at."""
+"""Maximum number of requests that wait for a cycle and are processed in it."""
 
 
 class Desk:
-    """Sets the emergency stop of one rack. Each one is reported in the `findings`."""
+    """Sets the emergency stop of one rack and reports each one in the `findings`.
+
+    Attributes:
+        count: Counters of answered, refused and dropped requests.
+    """
 
     def __init__(
         self, segment: Segment, grid: OwnGrid, askers: Mapping[str, int], findings: list[Finding]
     ) -> None:
-        """Answer the `askers`, each with the number by which alarms name it."""
+        """Create it for the permitted senders.
+
+        Args:
+            segment: Segment of the rack.
+            grid: Grid of the rack.
+            askers: Senders that may set the stop, with the number by which alarms refer to each.
+            findings: List to which a finding is added for each stop.
+        """
         self._rack = segment.rack
         self._grid = grid
         self._askers = askers
@@ -47,18 +57,18 @@ class Desk:
         self.count = zero_counts(LanDesk)
 
     def open(self, link: LanLink, launch: int) -> None:
-        """Take requests from now on."""
+        """Start to accept requests."""
         self._sealer = link.sealer
         self._launch = launch
         if self._askers:
             self._requests = link.answer(estop_key("*", self._rack), REQUESTS_A_CYCLE)
 
     def answer(self, tick: int) -> None:
-        """Answer the requests that have come."""
-        for asked, reply in self._requests():
-            head = self._sealer.opened(*asked)
-            asker = asked.key.split("/")[1]
-            if isinstance(head, Flaw) or head.kind != ESTOP_KIND or asked.payload:
+        """Answer the requests that have arrived, and latch the emergency stop if one demands it."""
+        for request, reply in self._requests():
+            head = self._sealer.opened(*request)
+            asker = request.key.split("/")[1]
+            if isinstance(head, Flaw) or head.kind != ESTOP_KIND or request.payload:
                 self.count.dropped += 1
                 continue
             if asker not in self._askers:
@@ -69,17 +79,18 @@ class Desk:
                 if not self._lines.emergency_stop:
                     self._findings.append(Finding(Alarm.REMOTE_STOP, self._askers[asker]))
                 self._lines.latch_emergency_stop()
-            # With session and number of the request: it cannot pass for the answer to another one.
+            # Echo session and number of the request, so that no other request is answered by this.
             answer = Envelope(ESTOP_KIND, self._launch, head.serial, head.launch, tick, 0, 0)
             reply(b"", self._sealer.seal(estop_answer_key(self._rack, asker), answer, b""))
 
     def resume(self, record: Any) -> None:
-        """Count on from the group of its predecessor's last status."""
+        """Restore the counters from the last status of the previous adapter."""
         self.count.record[...] = record
 
     def fill(self, record: object) -> None:
-        """Write its counts into the group of a status; in lockstep none, since they do not depend
-        on ticks alone.
+        """Write the counters into the group of a status.
+
+        Nothing is written in lockstep, because the counters do not depend on ticks alone.
         """
         if not self._grid.is_lockstep:
             fill_counts(record, self.count.record.item())

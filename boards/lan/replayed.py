@@ -1,8 +1,8 @@
-"""The network in a replay: what a recorded run in lockstep had from it comes again, at the same
-ticks. The other racks are not there.
+"""The network in a replay: recorded messages are repeated at the recorded ticks.
 
-The adapter's mailboxes are given out as they were recorded. Those of racks say, too, who came and
-who was lost, and when; what follows from that, alarms and messages that are void, follows again.
+The adapter's mailboxes are written as they were recorded; the other racks do not run. The recorded
+mailboxes of the racks also tell when a rack appeared and when it was lost. Alarms and void messages
+follow from that as in the recorded run.
 """
 
 from __future__ import annotations
@@ -20,9 +20,7 @@ from rack.levels.peer import PeerPresence, Presence, peer_port
 
 
 class ReplayedNetwork:
-    """What came of the `peers` and `imports` of an adapter, by the recorded messages of its
-    ports.
-    """
+    """Repeats what a recorded run received from the peers and imports of an adapter."""
 
     def __init__(
         self,
@@ -34,7 +32,7 @@ class ReplayedNetwork:
     ) -> None:
         self._imports: dict[str, tuple[Import, Replayed]] = {}
         for port, entry in imports.items():
-            # After what an adapter before this one has sent.
+            # Continue after the last message that the adapter sent before a restart.
             _, sent = last_written(segment, f"{board}.{port}")
             self._imports[port] = entry, Replayed(entries[port], port, is_sent=True, since=sent)
         ports = {peer.rack: peer_port(peer.rack) for peer in peers}
@@ -46,17 +44,22 @@ class ReplayedNetwork:
         self._tick = NEVER
 
     def begin(self, tick: int) -> None:
-        """Begin the cycle released at `tick`."""
+        """Start the cycle released at `tick`, up to which changes are reported."""
         self._tick = tick
 
     def changes(self) -> Iterator[tuple[str, int, bool]]:
-        """Yield who has come and who has gone by now, as a barrier does."""
+        """Yield the changes of presence up to this cycle, in the form of `Barrier.take_changes`."""
         while self._changes and self._changes[0][0] <= self._tick:
             _, rack, is_there = self._changes.pop(0)
             yield rack, NONE, is_there
 
     def give(self, write: Mapping[str, Any], tick: int) -> None:
-        """Write what was written in this cycle."""
+        """Write the messages that were recorded in this cycle.
+
+        Args:
+            write: Output ports of the adapter, by name.
+            tick: Release of the cycle.
+        """
         for entry, sent in self._imports.values():
             entry.look(tick)
             if sent.exchange({}, write, tick):
@@ -66,11 +69,11 @@ class ReplayedNetwork:
 
 
 def _seen(rack: str, rows: Rows) -> Iterator[tuple[int, str, bool]]:
-    """Yield when a rack came, and when it was lost."""
+    """Yield the tick, the rack and True when it appeared, or False when it was lost."""
     message = PeerPresence.zeros({})
-    before = int(Presence.AWAITED)
+    last_presence = int(Presence.AWAITED)
     for tick, _, content in rows:
         message.raw[:] = content
-        if message.presence != before:
-            before = int(message.presence)
-            yield tick, rack, before == Presence.THERE
+        if message.presence != last_presence:
+            last_presence = int(message.presence)
+            yield tick, rack, last_presence == Presence.THERE

@@ -1,6 +1,4 @@
-"""The status of the network adapter: what it counts of each export and import, and of everything
-else that came over the network.
-"""
+"""Status message of the network adapter, with counters of exports, imports and refusals."""
 
 from __future__ import annotations
 
@@ -16,84 +14,95 @@ C = TypeVar("C", bound=Message)
 
 
 def zero_counts(group: type[C]) -> C:
-    """Return the counts of a group of a status, all 0.
+    """Return a group of counters with all values 0.
 
-    Its integers are wider than those of the status, so that none overflows: see `fill_counts`.
+    Its integers are 64 bits wide, so that they cannot overflow before `fill_counts` limits them to
+    the width of the status.
     """
     fields = group.message_type.fields
     return group(np.dtype([(f.name, "f8" if f.python is float else "i8") for f in fields]))
 
 
 class LanExport(Message, version=1):
-    """Counts of one export, in the status of the network adapter."""
+    """Counters of one export in the status of the network adapter."""
 
     sent: int = counter("messages sent")
-    serial: int = field(unit="1", doc="serial of the newest message sent; 0: none")
+    serial: int = field(unit="1", doc="serial of the newest message sent, 0 if there is none")
 
 
 class LanImport(Message, version=1):
-    """Counts of one import, and its newest message, in the status of the network adapter."""
+    """Counters of one import, and its newest message, in the status of the network adapter."""
 
     taken: int = counter("messages passed to the backplane")
-    missing: int = counter("messages sent that never came, or came after a later one")
-    disordered: int = counter("messages that came after a later one, and were not passed")
-    repeated: int = counter("messages that came twice")
-    late: int = counter("messages older than max_age_ms when they came")
+    missing: int = counter("messages that never arrived or arrived after a later one")
+    disordered: int = counter("messages that arrived after a later one and were not passed on")
+    repeated: int = counter("messages that arrived twice")
+    late: int = counter("messages that were older than max_age_ms when they arrived")
     refused: int = counter(
-        "messages refused: malformed, unsigned, oversized, or not what its type permits"
+        "messages refused because they are malformed, unsigned, oversized or of another type"
     )
     unknown_launch: int = counter("messages of a launch that is over, or not there")
     superseded: int = counter("messages that a newer one overtook before the exchange")
     launch: int = field(
         unit="1",
-        doc="number of the launch that wrote the newest message taken; 0: none, or in lockstep",
+        doc="launch that wrote the newest message taken, 0 if there is none or in lockstep",
     )
-    number: int = field(unit="1", doc="number of that message among those sent from its mailbox")
-    serial: int = field(unit="1", doc="its serial in its mailbox; 0: none")
-    age: int = field(unit="tick", doc="age of its information in this rack's ticks; -1: none yet")
-    age_s: float = field(unit="s", doc="the same in simulated time; -1: none yet")
+    number: int = field(
+        unit="1", doc="number of that message among all messages sent from its mailbox"
+    )
+    serial: int = field(unit="1", doc="its serial in its mailbox, 0 if there is none")
+    age: int = field(
+        unit="tick", doc="age of its information in this rack's ticks, -1 if there is none"
+    )
+    age_s: float = field(unit="s", doc="the same in simulated time, -1 if there is none")
 
 
 class LanFlaws(Message, version=1):
-    """Counts of what came over the network and was dropped unread, by cause."""
+    """Counters of received messages that were dropped unread, by cause."""
 
     malformed: int = counter(
-        "not of this protocol, or of another version of it; in lockstep always 0"
+        "not of this protocol or of another version of it, always 0 in lockstep"
     )
     unsigned: int = counter(
-        "changed on the way, under another key, or not sealed by whom it names; likewise"
+        "changed on the way, under another key or not sealed by its sender, always 0 in lockstep"
     )
-    oversized: int = counter("longer than most_bytes; likewise")
+    oversized: int = counter("longer than most_bytes, always 0 in lockstep")
 
 
 class LanClocks(Message, version=1):
-    """Counts of the round trips by which racks compare their clocks."""
+    """Counters of the round trips by which racks compare their clocks."""
 
     taken: int = counter("round trips measured")
     answered: int = counter("pings of other racks answered")
-    withheld: int = counter("pings not answered: they came too fast, or from too many racks")
+    withheld: int = counter(
+        "pings not answered because they arrived too fast or from too many racks"
+    )
     refused: int = counter(
-        "pings and answers refused: malformed, unsigned, or to nothing that was asked"
+        "pings and answers refused because they are malformed, unsigned or unexpected"
     )
 
 
 class LanDesk(Message, version=1):
-    """Counts of the emergency stops that other machines asked for."""
+    """Counters of the emergency stops that other machines requested."""
 
     answered: int = counter(
-        "emergency stops from other machines that were set; in lockstep always 0"
+        "emergency stops from other machines that were set, always 0 in lockstep"
     )
-    refused: int = counter("emergency stops refused: not permitted; likewise")
-    dropped: int = counter("requests dropped: malformed, unsigned or oversized; likewise")
+    refused: int = counter(
+        "emergency stops refused because they are not permitted, always 0 in lockstep"
+    )
+    dropped: int = counter(
+        "requests dropped: malformed, unsigned or oversized, always 0 in lockstep"
+    )
 
 
 def status_of(exports: Iterable[str], imports: Iterable[str]) -> type[Status]:
-    """Return the class of an adapter's status: a group for each export and import."""
+    """Build the message class of an adapter's status, with a group for each export and import."""
     groups = {
         "clocks": field(LanClocks, doc="round trips to compare clocks; none in lockstep"),
         **{f"export_{port}": field(LanExport, doc=f"export {port}") for port in exports},
         **{f"import_{port}": field(LanImport, doc=f"import {port}") for port in imports},
         "desk": field(LanDesk, doc="emergency stops from other machines"),
-        "flaws": field(LanFlaws, doc="all that came and was dropped unread, by cause"),
+        "flaws": field(LanFlaws, doc="messages that were dropped unread, by cause"),
     }
     return make_message("lan_status", 1, Status, groups)

@@ -1,1 +1,1 @@
-"""Faults in a rack: injected while it runs, found again in its events, and judged."""
+"""Faults of a rack: injection while it runs, and verdicts from its events."""

@@ -1,6 +1,4 @@
-"""The state of a rack at its end, before its memory is released: its faults, its levels, its
-arm.
-"""
+"""State of a rack at the end of its run, read before its memory is released."""
 
 from __future__ import annotations
 
@@ -20,15 +18,17 @@ from rack.boards.faults.kind import KINDS, Kind, kind_of
 from rack.tools.console.answer import Failure
 
 EXTERNAL = "external kill"
-"""The kind, in reports, of a SIGKILL that a campaign itself sends, without the fault table."""
+"""Name, in reports, of a SIGKILL that a campaign sends directly, without the fault table."""
 
 AT_REST = 0.02
-"""Joint velocity below which an arm is at rest, rad/s."""
+"""Joint velocity below which an arm counts as at rest, rad/s."""
 
 
 def record_of(kind: str) -> Kind:
-    """Return the record of a kind in reports; a kill from outside is like any other. Raises
-    `Failure` for an unknown kind.
+    """Return the record of a kind in a report. A kill from outside is treated as a kill.
+
+    Raises:
+        Failure: The kind is unknown.
     """
     name = "kill" if kind == EXTERNAL else kind
     if name not in KINDS:
@@ -39,13 +39,22 @@ def record_of(kind: str) -> Kind:
 
 @dataclass(frozen=True)
 class Strike:
-    """A fault as the fault table holds it at the end of the run.
+    """A fault as recorded in the fault table at the end of the run.
 
-    `began` is its tick, -1: it did not begin; `ends` that of its end, in the run or planned, or
-    `NEVER`. `tick` and `time_ns` (CLOCK_MONOTONIC) are those at which it first acted, however
-    little (-1: it did not). `count` is how often it acted so much that it must be found, and
-    `hidden` the ticks from `tick` to the first time. `mailboxes` are those concerned; `joint` is a
-    name, or "" for none or all.
+    Attributes:
+        fault: Index in the fault table.
+        kind: Name of the kind.
+        board: Affected task.
+        began: Tick at which it began. -1 if it did not begin.
+        ends: Tick at which it ended or would have ended, or `NEVER`.
+        tick: Tick at which it first acted, however little. -1 if it did not act.
+        time_ns: CLOCK_MONOTONIC of its first action, ns.
+        count: How often it acted strongly enough to be detectable.
+        hidden: Ticks from `tick` to the first detectable action.
+        mailboxes: Affected mailboxes.
+        joint: Affected joint. Empty for none or all.
+        size: Size of the fault, if its kind has one.
+        injection: The fault as injected.
     """
 
     fault: int
@@ -64,24 +73,28 @@ class Strike:
 
     @property
     def first(self) -> int:
-        """The tick at which it first acted; at which it began, if it never did."""
+        """Tick at which it first acted or, if it never did, at which it began."""
         return self.tick if self.tick >= 0 else self.began
 
     @property
     def affected(self) -> tuple[str, ...]:
-        """The mailboxes whose messages it affects."""
+        """Mailboxes whose messages it affects."""
         return self.mailboxes if self.record.takes_mailbox else ()
 
     @property
     def record(self) -> Kind:
-        """The kind's record."""
+        """Record of its kind."""
         return record_of(self.kind)
 
 
 @dataclass(frozen=True)
 class ArmEnd:
-    """An arm at the end of a run: limits violated and touches, counted at every substep; whether it
-    is at rest.
+    """State of an arm at the end of a run.
+
+    Attributes:
+        violations: Number of violated limits, checked at every substep.
+        touches: Number of unintended contacts, checked at every substep.
+        is_at_rest: Whether all joints are at rest.
     """
 
     violations: int = 0
@@ -90,7 +103,7 @@ class ArmEnd:
 
 
 def strikes(segment: Segment, joints: Sequence[str]) -> tuple[Strike, ...]:
-    """Return everything injected into a rack, in the order of the fault table."""
+    """Return all faults that were injected into a rack, in the order of the fault table."""
     entries = FaultTable(segment).entries
     return tuple(
         _strike(entry, segment.layout, joints) for entry in entries if entry.stage != Stage.FREE
@@ -98,19 +111,21 @@ def strikes(segment: Segment, joints: Sequence[str]) -> tuple[Strike, ...]:
 
 
 def arm_of(segment: Segment) -> ArmEnd:
-    """Return the arm of a rack as its state and its levels last told; a rack without one violates
-    no limit.
+    """Return the state of a rack's arm from its newest messages.
+
+    A rack without an arm has no violations and is at rest.
     """
-    seen = [status for _, status in statuses(segment, "violations")]
-    counted = [*seen, *(state for _, state in arm_states(segment))]
+    arm_statuses = [status for _, status in statuses(segment, "violations")]
+    all_states = [*arm_statuses, *(state for _, state in arm_states(segment))]
     return ArmEnd(
-        violations=max((arm.violations for arm in counted), default=0),
-        touches=max((arm.touches for arm in counted), default=0),
-        is_at_rest=all(np.abs(arm.velocity).max() < AT_REST for arm in seen),
+        violations=max((arm.violations for arm in all_states), default=0),
+        touches=max((arm.touches for arm in all_states), default=0),
+        is_at_rest=all(np.abs(arm.velocity).max() < AT_REST for arm in arm_statuses),
     )
 
 
 def _strike(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> Strike:
+    """Convert an entry of the fault table."""
     kind = kind_of(entry)
     values = kind.values(entry)
     board = board_of(entry, layout)

@@ -1,6 +1,4 @@
-"""Events as evidence of faults: which event can be the detection of which fault, and the reactions
-to it.
-"""
+"""Events as evidence of faults: which event may detect which fault, and which reactions follow."""
 
 from __future__ import annotations
 
@@ -19,6 +17,7 @@ from rack.tools.faults.ending import Strike
 
 
 def _codes(alarms: Iterable[Alarm]) -> set[str]:
+    """Return the codes of events that correspond to alarms."""
     return {alarm.name.lower() for alarm in alarms}
 
 
@@ -29,25 +28,25 @@ CLOCK_ALARMS = _codes(alarm for alarm in Alarm if Alarm.CLOCK_STOPPED <= alarm <
 TASK_ALARMS = _codes((Alarm.HANG, Alarm.LATE, Alarm.PLAN_LATE, Alarm.STARVED))
 BRAKES = "brakes_closed"
 LATCHED = "latched"
-"""Code of the reaction to a fault that has lasted too long: the brakes stay engaged, and the task
-ends."""
+"""Code of the reaction to a fault that lasted too long: brakes stay closed and the task ends."""
 COLLISION = Alarm.COLLISION.name.lower()
-"""Code of the detection to which brakes in the same tick are a reaction; they are none to a fault
-then."""
+"""Code of a collision. Brakes that close in the same tick react to it and not to a fault."""
 UNDONE_BY: Mapping[str, str] = {BRAKES: "brakes_opened", "demand": "demand", "restart": "rejoined"}
-"""Reactions, and the recovery that undoes each."""
+"""Code of the recovery that undoes each reaction."""
 TAKE_CYCLES: tuple[Where, ...] = ("process", "load", "core", "lock", "clock")
-"""Places of faults that keep boards from their cycles."""
+"""Places of faults that may keep boards from their cycles."""
 
 
 @dataclass(frozen=True)
 class Detection:
-    """An event that reports a fault: how long after it struck, and the time permitted (None: no
-    bound).
+    """An event that reports a fault, with its delay and its bound.
 
-    `delay` and `bound` are ticks; ticks that the clock itself skipped did not happen and are not
-    counted. `delay_ms` is wall-clock time, None in lockstep, where it means nothing. `bound_ms` is
-    the bound of a death in real time, and then the only one.
+    Attributes:
+        event: The event.
+        delay: Ticks from the fault's first action, without ticks that the clock skipped.
+        bound: Largest permitted delay in ticks. None if there is no bound.
+        delay_ms: Delay in wall-clock time, ms. None in lockstep, where it means nothing.
+        bound_ms: Bound of a death in real time, ms. It then replaces `bound`.
     """
 
     event: Event
@@ -58,28 +57,29 @@ class Detection:
 
     @property
     def is_within(self) -> bool:
-        """Whether the fault was found within its bound."""
+        """Whether the fault was detected within its bound."""
         if self.bound_ms is not None and self.delay_ms is not None:
             return self.delay_ms <= self.bound_ms
         return self.bound is None or self.delay <= self.bound
 
     @property
     def order(self) -> tuple[bool, int, float, float, str]:
-        """Key by which the best of several detections comes first: one within its bound, then the
-        earliest, then that of the tightest bound, then by board.
+        """Sort key by which the best of several detections comes first.
 
-        In lockstep boards find a fault in the same tick, in an order that is chance.
+        Detections within their bounds come first, then early ones, then ones with a tight bound.
+        The name of the board decides last: in lockstep, boards may detect a fault in the same tick
+        and report it in any order.
         """
         bound = math.inf if self.bound is None else self.bound
         return not self.is_within, self.delay, self.delay_ms or 0.0, bound, self.event.board
 
 
 def fits(event: Event, strike: Strike) -> bool:
-    """Return whether an event can be the detection of a fault: of its kind, about the same thing,
-    and not before it.
+    """Return True if an event can be the detection of a fault.
 
-    A fault may strike a moment before its tick is given out; a process that reads the tick then
-    sees the one before.
+    It must be of the right kind, concern the same target, and not come before the fault. A death
+    may have the tick before the fault's tick, because a fault may act shortly before other
+    processes can read the new tick.
     """
     return (
         event.kind in FOUND
@@ -90,24 +90,22 @@ def fits(event: Event, strike: Strike) -> bool:
 
 
 def explains(strike: Strike, event: Event) -> bool:
-    """Return whether an event in a fault's time can come of it: as its detection, or as a
-    consequence of its kind.
-    """
-    follows = strike.record.consequence
+    """Return True if an event during a fault may be its detection or a consequence of its kind."""
+    consequence = strike.record.consequence
     if event.kind == "miss":
-        # A fault that takes one task's cycles may take those of any task on its core.
+        # A fault that takes one task's cycles may take cycles of any task on the same core.
         return takes_cycles(strike)
     if event.kind == DIED:
-        return strike.board == event.board and follows.ends_process
-    if event.code in _codes(follows.arm):
+        return strike.board == event.board and consequence.ends_process
+    if event.code in _codes(consequence.arm):
         return True
-    return event.code in _codes(follows.own).union(strike.record.codes) and is_about(event, strike)
+    return event.code in _codes(consequence.own).union(strike.record.codes) and is_about(
+        event, strike
+    )
 
 
 def is_about(event: Event, strike: Strike) -> bool:
-    """Return whether an event is about the target of a fault: its mailboxes, its task, its
-    joint.
-    """
+    """Return True if an event concerns the target of a fault: its mailboxes, task or joint."""
     if event.code == DIED:
         return event.board == strike.board
     if event.code in MAILBOX_ALARMS:
@@ -116,7 +114,7 @@ def is_about(event: Event, strike: Strike) -> bool:
         return event.subject == strike.board
     if event.code in CLOCK_ALARMS:
         return strike.board == CLOCK
-    # An alarm about all joints may be about any, and the other way round.
+    # An alarm about all joints may concern any joint, and a fault of all joints any alarm.
     return not event.subject or not strike.joint or event.subject in (strike.joint, ALL_JOINTS)
 
 
@@ -128,8 +126,9 @@ class SkippedTicks:
         self._skips = [event for event in events if event.kind == "miss" and event.code == name]
 
     def between(self, first: int, last: int) -> int:
-        """Return how many ticks after `first`, up to `last`, did not happen: as many as any one
-        task has missed.
+        """Return how many ticks after `first`, up to `last`, were skipped.
+
+        Every task reports the skips that it has noticed, so the largest count of one task is taken.
         """
         by_task = Counter[str]()
         for event in self._skips:
@@ -139,12 +138,15 @@ class SkippedTicks:
 
 
 class Aftermath(NamedTuple):
-    """Reactions by code, whether all of them were undone, and the ticks from the strike to the last
-    undone.
+    """Reactions to a fault.
 
-    Lost messages are undone when a good one, made after the fault, was seen in each mailbox that
-    owes one. `lacking`: codes of reactions that must follow a fault of this kind, and did not;
-    brakes that were engaged when it struck cannot be engaged again.
+    Attributes:
+        reactions: Codes of the reactions.
+        is_undone: Whether all reactions were undone and all lost messages replaced. A message is
+            replaced when a good message that was made after the fault was seen in the mailbox.
+        recovery: Ticks from the fault's first action until the last reaction was undone.
+        lacking: Codes of required reactions that did not follow. Brakes that were already closed
+            are not required to close.
     """
 
     reactions: tuple[str, ...] = ()
@@ -156,45 +158,50 @@ class Aftermath(NamedTuple):
 def aftermath(
     strike: Strike, events: Sequence[Event], horizon: int, owed: Sequence[str]
 ) -> Aftermath:
-    """Return the reactions to a fault and their end; reactions from tick `horizon` on are not to
-    it.
+    """Find the reactions to a fault and when they were undone.
 
-    `owed`: mailboxes that must have a new message after it.
+    Args:
+        strike: The fault.
+        events: Events of the run.
+        horizon: Tick from which reactions no longer belong to the fault.
+        owed: Mailboxes in which a new message must appear after the fault.
     """
     if strike.tick < 0:
         return Aftermath()
-    after = [event for event in events if event.tick >= strike.tick]
-    collisions = {event.tick for event in after if event.code == COLLISION}
+    events_after = [event for event in events if event.tick >= strike.tick]
+    collisions = {event.tick for event in events_after if event.code == COLLISION}
     reactions = [
         event
-        for event in after
+        for event in events_after
         if event.kind == "reaction"
         and event.tick < horizon
         and not (event.code == BRAKES and event.tick in collisions)
         and _can_react(strike, event)
     ]
-    undone = [_undone(reaction, after) for reaction in reactions]
+    undone_ticks = [_undone(reaction, events_after) for reaction in reactions]
     flows = {
-        e.subject: e.tick for e in reversed(after) if e.code == "flows" and e.tick >= strike.ends
+        event.subject: event.tick
+        for event in reversed(events_after)
+        if event.code == "flows" and event.tick >= strike.ends
     }
-    undone += [flows.get(mailbox) for mailbox in owed]
+    undone_ticks += [flows.get(mailbox) for mailbox in owed]
     names = tuple(dict.fromkeys(event.code for event in reactions))
     lacking = tuple(
         code
         for code in strike.record.consequence.reactions
         if code not in names and not (code == BRAKES and _are_engaged(strike.tick, events))
     )
-    ticks = [tick for tick in undone if tick is not None]
-    is_undone = len(ticks) == len(undone)
-    recovery = max(ticks) - strike.tick if ticks and is_undone else None
+    known_ticks = [tick for tick in undone_ticks if tick is not None]
+    is_undone = len(known_ticks) == len(undone_ticks)
+    recovery = max(known_ticks) - strike.tick if known_ticks and is_undone else None
     return Aftermath(names, is_undone, recovery, lacking)
 
 
 def _can_react(strike: Strike, reaction: Event) -> bool:
-    """Return whether a reaction can be to a fault: brakes that engage for missed cycles are to one
-    that takes cycles.
+    """Return True if a reaction may be caused by a fault.
 
-    A latch is a reaction to a kind that may be latched.
+    Brakes that close because of missed cycles need a fault that takes cycles. A latch needs a kind
+    that may latch.
     """
     if reaction.code == LATCHED:
         return strike.record.consequence.latches
@@ -203,24 +210,22 @@ def _can_react(strike: Strike, reaction: Event) -> bool:
 
 
 def takes_cycles(strike: Strike) -> bool:
-    """Return whether a fault keeps tasks from their cycles, so that these are missed because of
-    it.
-    """
+    """Return True if a fault may keep tasks from their cycles."""
     return strike.record.where in TAKE_CYCLES
 
 
 def _are_engaged(tick: int, events: Sequence[Event]) -> bool:
-    """Return whether the brakes were engaged before a tick, and are released after it."""
-    before = [e for e in events if e.kind == "reaction" and e.code == BRAKES and e.tick < tick]
-    undone = (_undone(event, events) for event in before)
+    """Return True if the brakes were closed before a tick and opened only after it."""
+    brakings = [e for e in events if e.kind == "reaction" and e.code == BRAKES and e.tick < tick]
+    undone = (_undone(event, events) for event in brakings)
     return any(released is None or released > tick for released in undone)
 
 
-def _undone(reaction: Event, after: Sequence[Event]) -> int | None:
-    """Return the tick at which a reaction was undone; None when it was not."""
+def _undone(reaction: Event, events_after: Sequence[Event]) -> int | None:
+    """Return the tick at which a reaction was undone, or None."""
     recoveries = (
         event.tick
-        for event in after
+        for event in events_after
         if event.kind == "recovery"
         and event.code == UNDONE_BY.get(reaction.code)
         and event.tick >= reaction.tick

@@ -1,6 +1,4 @@
-"""The judge of faults: did each strike, was it found within its bound, reacted to, and recovered
-from?
-"""
+"""Judgement of faults: whether each acted, was detected in time, and was recovered from."""
 
 from __future__ import annotations
 
@@ -33,19 +31,38 @@ Seen = Literal["detected", "missed", "not struck"]
 Report = dict[str, Any]
 
 SETTLE_S = 0.25
-"""Simulated time after a fault's bounds in which its traces may still be found."""
+"""Simulated time after a fault's bounds in which its effects may still be reported."""
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """The judgement of one fault. Delays, bounds and recovery are ticks, `cycle` the ticks of the
-    task's cycle.
+    """Judgement of one fault. Delays, bounds and recovery are in ticks.
 
-    `is_judged`: False for a size below the one from which its kind must be found. `recovery` is the
-    time from the strike until every reaction is undone and struck messages flow again; None: there
-    was nothing to recover from, or it was not seen. `bound` and `recovery_bound` are counted from
-    the strike too. `lacking` are required reactions that did not follow. `is_latched`: the kind may
-    end the task, and it did.
+    Attributes:
+        kind: Name of the kind.
+        board: Affected task.
+        struck: Tick at which it first acted. -1 if it did not act.
+        seen: Whether it was detected.
+        mailbox: Affected mailbox, if it is one.
+        joint: Affected joint, if it is one.
+        size: Size of the fault, if its kind has one.
+        began: Tick at which it began. -1 if it did not begin.
+        is_judged: False if the fault is smaller than the size from which it must be detected.
+        cycle: Cycle of the affected task, ticks.
+        found_by: Board that detected it.
+        found_as: Code of the detection.
+        delay: Ticks from its first action to its detection.
+        delay_ms: The same in wall-clock time, ms.
+        bound: Largest permitted delay, ticks. None if there is no bound.
+        bound_ms: Largest permitted delay in wall-clock time, ms.
+        is_within: Whether it was detected within its bound.
+        reactions: Codes of the reactions to it.
+        is_recovered: Whether it was recovered from within the bound.
+        recovery: Ticks from its first action until every reaction was undone and affected messages
+            flowed again. None if that was not seen or if there was no reaction.
+        recovery_bound: Largest permitted value of `recovery`.
+        lacking: Required reactions that did not follow.
+        is_latched: Whether the fault ended the task, as its kind permits.
     """
 
     kind: str
@@ -74,9 +91,7 @@ class Judgement:
 
     @property
     def part_of_bound(self) -> float | None:
-        """The delay as a part of its bound, in time where time is bounded; None without a bound, or
-        with bound 0.
-        """
+        """Delay divided by its bound, in time if time is bounded. None without a bound."""
         if self.bound_ms is not None and self.delay_ms is not None:
             return self.delay_ms / self.bound_ms
         return self.delay / self.bound if self.bound and self.delay is not None else None
@@ -84,7 +99,7 @@ class Judgement:
 
 @dataclass(frozen=True)
 class FaultVerdict:
-    """The judgements of a run's faults, and the detections and misses that no fault explains."""
+    """Judgements of a run's faults, and the detections and misses that no fault explains."""
 
     faults: tuple[Judgement, ...]
     unexplained: tuple[Event, ...]
@@ -93,11 +108,15 @@ class FaultVerdict:
 
 @dataclass(frozen=True)
 class Circumstances:
-    """The run whose faults are judged.
+    """Facts about the run whose faults are judged.
 
-    `offset_ns` turns CLOCK_MONOTONIC into the events' time. `restart_s`: simulated time that a
-    restart may take. `has_failed`: the task ended with an error, as some kinds permit. `moving`:
-    obstacles that move, and may run into an arm that a fault has stopped in their way.
+    Attributes:
+        layout: Layout of the rack.
+        offset_ns: Difference that converts CLOCK_MONOTONIC to the time of the events, ns.
+        is_lockstep: Whether the run was in lockstep.
+        restart_s: Simulated time that a restart may take, s.
+        has_failed: Whether the task ended with an error, as some kinds permit.
+        moving: Obstacles that move, and may collide with an arm that a fault has stopped.
     """
 
     layout: Layout
@@ -111,15 +130,21 @@ class Circumstances:
 def judge(strikes: Sequence[Strike], events: Sequence[Event], run: Circumstances) -> FaultVerdict:
     """Judge the faults of a run by its events.
 
-    One event is the detection of one fault: of two that it fits, of the one that struck first and
-    is not found yet. A fault of the arm that is over before its bound, and is not found, has not
-    struck; nor has one whose run ends before the bound of its recovery.
+    An event detects one fault only. If it matches two, it counts for the one that acted first and
+    is not yet detected. A fault of the arm that ended before its bound without being detected
+    counts as not having acted, and so does a fault whose run ended before the bound of its
+    recovery.
+
+    Args:
+        strikes: Faults of the run.
+        events: Events of the run.
+        run: Facts about the run.
     """
     return Judge(strikes, events, run).verdict()
 
 
 class Judge:
-    """The judge of one run's faults."""
+    """Judges the faults of one run."""
 
     def __init__(
         self, strikes: Sequence[Strike], events: Sequence[Event], run: Circumstances
@@ -127,7 +152,7 @@ class Judge:
         self._events = events
         self._run = run
         self._layout = run.layout
-        self._strikes = sorted(strikes, key=lambda s: (s.first, s.fault))
+        self._strikes = sorted(strikes, key=lambda strike: (strike.first, strike.fault))
         self._tasks = [process.name for process in run.layout.processes]
         self._cycles = {task.name: cycle_ticks(run.layout, task.name) for task in run.layout.tasks}
         self._skipped = SkippedTicks(events)
@@ -135,19 +160,21 @@ class Judge:
         self._settle = round(SETTLE_S * 1e9 / run.layout.clock_ns)
 
     def verdict(self) -> FaultVerdict:
-        """Return the judgement of each fault, and what none of them explains."""
+        """Return the judgement of each fault, and the events that no fault explains."""
         used: set[int] = set()
         judged = []
         windows = [self._window(strike) for strike in self._strikes]
-        for place, strike in enumerate(self._strikes):
-            last = windows[place][1]
-            later = self._strikes[place + 1 :]
-            found = self._detections(strike, last, used)
-            own = [detection for detection in found if not self._is_of_any(detection, later)]
-            # Reactions up to this tick are of this fault: then the next one strikes, or it is
-            # long over.
+        for index, strike in enumerate(self._strikes):
+            last = windows[index][1]
+            later = self._strikes[index + 1 :]
+            detections = self._detections(strike, last, used)
+            own_detections = [
+                detection for detection in detections if not self._is_of_any(detection, later)
+            ]
+            # Reactions belong to this fault until the next one acts, or until this one is long
+            # over.
             horizon = min([*(s.tick for s in later if s.tick > strike.tick), last + 1])
-            best = min(own, key=lambda detection: detection.order, default=None)
+            best = min(own_detections, key=lambda detection: detection.order, default=None)
             if best:
                 used.add(id(best.event))
             elif self._is_brief(strike):
@@ -155,8 +182,8 @@ class Judge:
             judgement = self._judgement(strike, best, horizon)
             is_too_early = self._last < strike.tick + (judgement.recovery_bound or 0)
             if not judgement.is_recovered and is_too_early and strike.ends < NEVER:
-                # The run ended too early to decide: a campaign draws it again. A fault without an
-                # end has no recovery.
+                # The run ended too early to decide, so a campaign will draw the fault again. A
+                # fault without an end has no recovery.
                 judgement = self._judgement(replace(strike, tick=-1), None, horizon)
             judged.append(judgement)
         stray = [event for event in self._events if self._is_stray(event, windows)]
@@ -167,10 +194,10 @@ class Judge:
         )
 
     def _bound(self, strike: Strike, reader: str | None = None) -> int | None:
-        """Return the ticks from its strike within which a fault must be found, by a reader or,
-        None, by any process.
+        """Return the ticks from the first action of a fault within which it must be detected.
 
-        One that never shows need not be found.
+        None if there is no bound, or if the fault never had a detectable effect. Without a
+        `reader`, the bound is for the first process to detect it.
         """
         task = self._tasks.index(strike.board) if strike.board in self._tasks else -1
         injection = strike.injection or Injection(strike.record.number, task)
@@ -178,91 +205,94 @@ class Judge:
         return bound + strike.hidden if bound is not None and strike.count else None
 
     def _recovery(self, strike: Strike) -> int:
+        """Return the ticks within which a fault must have been recovered from."""
         return strike.record.recovery_ticks(strike.board, self._layout, self._run.restart_s)
 
     def _window(self, strike: Strike) -> tuple[int, int]:
-        """Return the first and the last tick at which an event may come of a fault."""
+        """Return the first and the last tick at which an event may be caused by a fault."""
         if strike.record.takes_mailbox and self._layout.task(strike.board).role == "planner":
-            # The plan's writer itself may find the fault, when it makes the next plan.
+            # The planner itself may notice the fault, but only when it makes its next plan.
             return strike.first - 1, self._last
         return strike.first - 1, self._last_trace(strike, min(end_of(strike), self._last))
 
     def _last_trace(self, strike: Strike, ends: int) -> int:
-        """Return the last tick at which an event may come of a fault that ends at a tick."""
+        """Return the last tick at which a fault that ends at tick `ends` may cause an event."""
         over = max(ends, strike.first + (self._bound(strike) or 0))
         read = last_read(strike.mailboxes, self._layout)
         return over + self._recovery(strike) + read + self._settle
 
-    def _detections(self, strike: Strike, until: int, used: set[int]) -> list[Detection]:
+    def _detections(self, strike: Strike, last_tick: int, used: set[int]) -> list[Detection]:
+        """Return the unused events up to `last_tick` that may be the detection of a fault."""
         if not strike.count:
-            # It need not be found: whatever is found after its end is of something else.
-            until = min(until, strike.ends)
+            # It need not be detected, so any later detection belongs to something else.
+            last_tick = min(last_tick, strike.ends)
         fitting = (
-            e for e in self._events if e.tick <= until and fits(e, strike) and id(e) not in used
+            event
+            for event in self._events
+            if event.tick <= last_tick and fits(event, strike) and id(event) not in used
         )
         return [self._detection(event, strike) for event in fitting]
 
     def _is_periodic(self, mailbox: str) -> bool:
-        """Return whether a mailbox has a message in every period: no plan, queue or news has, nor a
-        host board's.
+        """Return True if a mailbox has a message in every period of its writer.
+
+        Plans, queues, mailboxes for news, and the mailboxes of host boards do not.
         """
-        box = self._layout.mailbox(mailbox)
+        mailbox_spec = self._layout.mailbox(mailbox)
         return (
-            self._layout.task(box.writer).role == "executor"
-            and box.protocol != "queue"
-            and not box.max_age
+            self._layout.task(mailbox_spec.writer).role == "executor"
+            and mailbox_spec.protocol != "queue"
+            and not mailbox_spec.max_age
         )
 
-    def _is_of_any(self, late: Detection, later: Sequence[Strike]) -> bool:
-        """Return whether a detection, too late for one fault, is in time for one of those that
-        struck after it.
-        """
-        return not late.is_within and any(
-            fits(late.event, strike) and self._detection(late.event, strike).is_within
+    def _is_of_any(self, detection: Detection, later: Sequence[Strike]) -> bool:
+        """Return True if a detection that is too late for one fault is in time for a later one."""
+        return not detection.is_within and any(
+            fits(detection.event, strike) and self._detection(detection.event, strike).is_within
             for strike in later
         )
 
     def _is_brief(self, strike: Strike) -> bool:
-        """Return whether a fault of the arm never showed, or in fewer cycles than it may take to be
-        found.
-        """
+        """Return True if a fault of the arm ended before it had to be detected."""
         if strike.record.where != "arm":
             return False
-        until = strike.hidden + strike.count * cycle_ticks(self._layout, strike.board)
-        return not strike.count or until < (self._bound(strike) or 0)
+        active_ticks = strike.hidden + strike.count * cycle_ticks(self._layout, strike.board)
+        return not strike.count or active_ticks < (self._bound(strike) or 0)
 
     def _detection(self, event: Event, strike: Strike) -> Detection:
+        """Return an event as the detection of a fault, with its delay and its bound."""
         delay = max(0, event.tick - strike.tick)
         if event.code != "clock_skipped":
             delay -= self._skipped.between(strike.tick, event.tick)
         reader = event.board if event.code in MAILBOX_ALARMS else None
         bound = self._bound(strike, reader)
         if self._run.is_lockstep:
-            # Lockstep waits for the end of a process that its own clock has killed. It knows
-            # nothing of any other, and runs as fast as it can: neither ticks nor time are a
-            # measure.
+            # In lockstep the clock waits for the end of a process that it has killed itself. A
+            # kill from outside is not known to the clock, which runs as fast as it can, so neither
+            # ticks nor time measure the delay.
             if event.kind == DIED and strike.kind == EXTERNAL:
                 bound = None
             return Detection(event, delay, bound)
-        # A fault of the arm is counted after the cycle that has already found it.
+        # The delay may be negative: a fault of the arm is recorded after the cycle that found it.
         delay_ms = max(0, event.time_ns - self._run.offset_ns - strike.time_ns) * 1e-6
         bound_ms = (RACK_NS + MEMORY_NS) * 1e-6 if event.kind == DIED else None
         return Detection(event, delay, bound, delay_ms, bound_ms)
 
     def _judgement(self, strike: Strike, best: Detection | None, horizon: int) -> Judgement:
+        """Judge a fault by its best detection and by the reactions up to `horizon`."""
         visible_from = strike.record.visible_from
         owed = tuple(filter(self._is_periodic, strike.affected)) or strike.affected
-        after = aftermath(strike, self._events, horizon, owed)
-        found = best.event.tick if best else strike.tick
-        # Ticks from the strike within which every reaction must be undone.
-        ends = max(min(end_of(strike), self._last), found)
+        aftermath_found = aftermath(strike, self._events, horizon, owed)
+        found_tick = best.event.tick if best else strike.tick
+        # Ticks from the first action within which every reaction must be undone.
+        ends = max(min(end_of(strike), self._last), found_tick)
         recovery_bound = ends - strike.tick + self._recovery(strike)
         if not all(map(self._is_periodic, owed)):
-            # Nothing says when its writer has something to write.
+            # The writer has no period, so its next message may come at any time in the run.
             recovery_bound = self._last + 1 - strike.tick
-        # Only a kind that may end the task with an error has this reaction.
-        is_latched = self._run.has_failed and LATCHED in after.reactions
-        is_undone = after.is_undone and (after.recovery or 0) <= recovery_bound
+        # Only kinds that may end the task with an error have this reaction.
+        is_latched = self._run.has_failed and LATCHED in aftermath_found.reactions
+        is_undone = aftermath_found.is_undone and (aftermath_found.recovery or 0) <= recovery_bound
         return Judgement(
             kind=strike.kind,
             board=strike.board,
@@ -273,20 +303,20 @@ class Judge:
             struck=strike.tick,
             is_judged=visible_from is None or (strike.size or 0.0) >= visible_from,
             cycle=cycle_ticks(self._layout, strike.board),
-            reactions=after.reactions,
+            reactions=aftermath_found.reactions,
             is_recovered=is_latched or is_undone,
-            recovery=after.recovery,
+            recovery=aftermath_found.recovery,
             recovery_bound=recovery_bound,
-            lacking=after.lacking,
+            lacking=aftermath_found.lacking,
             is_latched=is_latched,
             **self._seen(strike, best),
         )
 
     def _seen(self, strike: Strike, best: Detection | None) -> Report:
-        """Return what a judgement says of the detection of a fault."""
+        """Return the fields of a judgement that describe the detection."""
         if best is None:
-            seen = "not struck" if strike.tick < 0 else "missed"
-            return {"seen": seen, "bound": self._bound(strike)}
+            seen_text = "not struck" if strike.tick < 0 else "missed"
+            return {"seen": seen_text, "bound": self._bound(strike)}
         return {
             "seen": "detected",
             "found_by": "the Rack" if best.event.kind == DIED else best.event.board,
@@ -299,21 +329,22 @@ class Judge:
         }
 
     def _is_stray(self, event: Event, windows: Sequence[tuple[int, int]]) -> bool:
-        """Return whether no fault explains a detection, a death or a miss."""
+        """Return True if an event is a detection, a death or a miss that no fault explains."""
         if event.kind not in FOUND or self._is_met(event):
             return False
-        # An event of a task has the tick of its release, and may come of anything until the end of
-        # its cycle.
-        until = event.tick + self._cycles.get(event.board, 1) - 1
+        # An event of a task has the tick of its release, but its cause may act until the end of
+        # the cycle.
+        last_tick = event.tick + self._cycles.get(event.board, 1) - 1
         return not any(
-            strike.tick >= 0 and first <= until and event.tick <= last and explains(strike, event)
+            strike.tick >= 0
+            and first <= last_tick
+            and event.tick <= last
+            and explains(strike, event)
             for strike, (first, last) in zip(self._strikes, windows, strict=True)
         )
 
     def _is_met(self, event: Event) -> bool:
-        """Return whether an obstacle has hit an arm that a fault has stopped, or that waits for
-        another path since.
-        """
+        """Return True if a moving obstacle hit an arm that an earlier fault may have stopped."""
         is_moving = event.code == COLLISION and any(
             f"'{name}'" in event.text for name in self._run.moving
         )
@@ -321,28 +352,30 @@ class Judge:
 
 
 def end_of(strike: Strike) -> int:
-    """Return the tick at which a fault ends, in the run or as planned."""
-    # A task that hangs is killed as soon as that is found, however long it was to hang.
+    """Return the tick at which a fault ended or would have ended."""
+    # A hanging task is killed as soon as the hang is detected, before the fault's planned end.
     return strike.tick if strike.record.consequence.ends_process else strike.ends
 
 
 def faults(recorded: Sequence[Mapping[str, Any]], layout: Layout) -> Report:
-    """Return every fault injected into a run, detections that none explains, and restarts by task,
-    by its events.
-    """
+    """Judge the recorded events of a run and return the results for its report."""
     events = [Event(**event) for event in recorded if "tick" in event]
-    ended: Mapping[str, Any] = next((event for event in recorded if event["kind"] == "outcome"), {})
-    strikes = TypeAdapter(tuple[Strike, ...]).validate_python(ended.get("faults", ()))
+    outcome: Mapping[str, Any] = next(
+        (event for event in recorded if event["kind"] == "outcome"), {}
+    )
+    strikes = TypeAdapter(tuple[Strike, ...]).validate_python(outcome.get("faults", ()))
     is_lockstep = any(event.kind == "start" and event.text == "lockstep" for event in events)
     verdict = judge(
-        strikes, events, Circumstances(layout, ended.get("clock_offset_ns", 0), is_lockstep)
+        strikes, events, Circumstances(layout, outcome.get("clock_offset_ns", 0), is_lockstep)
     )
     restarts = Counter(event.board for event in events if event.code == "restart")
     return {
         # Faults that never struck come last.
         "faults": [
-            _row(found, layout)
-            for found in sorted(verdict.faults, key=lambda f: (f.struck < 0, f.struck))
+            _row(judgement, layout)
+            for judgement in sorted(
+                verdict.faults, key=lambda fault: (fault.struck < 0, fault.struck)
+            )
         ],
         "unexplained": [
             {
@@ -357,19 +390,21 @@ def faults(recorded: Sequence[Mapping[str, Any]], layout: Layout) -> Report:
     }
 
 
-def _row(found: Judgement, layout: Layout) -> Report:
+def _row(judgement: Judgement, layout: Layout) -> Report:
+    """Return a judgement as a row of the report."""
     tick_ms = layout.clock_ns * 1e-6
-    recovery_ms = None if found.recovery is None else round(found.recovery * tick_ms, 6)
+    recovery_ms = None if judgement.recovery is None else round(judgement.recovery * tick_ms, 6)
     return {
-        **asdict(found),
-        # Lists, as they are when read back from JSON.
-        "reactions": list(found.reactions),
-        "lacking": list(found.lacking),
-        "delay_cycles": _in_cycles(found.delay, found.cycle),
-        "bound_cycles": _in_cycles(found.bound, found.cycle),
+        **asdict(judgement),
+        # Convert tuples to lists, so that the row equals itself when read back from JSON.
+        "reactions": list(judgement.reactions),
+        "lacking": list(judgement.lacking),
+        "delay_cycles": _in_cycles(judgement.delay, judgement.cycle),
+        "bound_cycles": _in_cycles(judgement.bound, judgement.cycle),
         "recovery_ms": recovery_ms,
     }
 
 
 def _in_cycles(ticks: int | None, cycle: int) -> float | None:
+    """Convert ticks to cycles of the affected task."""
     return None if ticks is None else round(ticks / cycle, 3)

@@ -1,4 +1,4 @@
-"""Faults in a running rack: written as in a config, put into its fault table, and followed."""
+"""Faults in a running rack: written as in a config, added to its fault table, and followed."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ from rack.tools.console.held import waits
 from rack.tools.console.tables import fitted
 
 BEGIN_S = 5.0
-"""Longest wait for a fault to begin at the next tick."""
+"""Maximum wait for a fault to begin at the next tick."""
 LOOK_S = 0.001
 NEXT_TICK = "the next tick"
 SEEDS = 2**31
 
 
 class LiveRack:
-    """A running rack, with its config and its fault table."""
+    """Injects faults into a running rack."""
 
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
@@ -47,11 +47,19 @@ class LiveRack:
     def inject(
         self, given: Mapping[str, Any], wait: bool, timeout_s: float | None = None
     ) -> Document:
-        """Inject a fault; return it as plain data when it has begun, or, with a tick, a condition
-        or on a rack that is held, when it is armed.
+        """Inject a fault and return it as plain data.
 
-        With `wait`, return when it is over. Raises `ConfigError` with every mistake, and `Failure`
-        when it does not begin, or is not over within `timeout_s` of wall-clock time.
+        Without `wait`, the call returns when the fault has begun. If the fault has a tick or a
+        condition, or if the rack is held, it returns at once.
+
+        Args:
+            given: Keys of `[[fault]]`. Values of None are ignored.
+            wait: Whether to wait until the fault is over.
+            timeout_s: Maximum wall-clock time to wait for the end, s. None waits without limit.
+
+        Raises:
+            ConfigError: The fault has mistakes. All of them are reported.
+            Failure: The run is over, or the fault does not begin or end in time.
         """
         if self._segment.run_is_over:
             raise Failure(f"rack '{self._segment.rack}': its run is over")
@@ -60,36 +68,38 @@ class LiveRack:
         self._check(fault)
         entry = self._table.add(checked)
         if KINDS[fault.kind].where == "core":
-            # This very process takes the core.
+            # This process itself takes the core.
             self._print_waiting(entry)
             act_on_core(self._segment, entry.index)
         elif fault.tick is None and fault.when is None:
-            held = self._segment.words
+            words = self._segment.words
             if not self._wait_until(
-                lambda: entry.stage != Stage.WAITING or held[System.HELD] > 0, BEGIN_S
+                lambda: entry.stage != Stage.WAITING or words[System.HELD] > 0, BEGIN_S
             ):
                 why = f"the clock has not begun it within {BEGIN_S:g} s"
                 raise Failure(f"{self._described(entry)}: {why}")
-            if not held[System.HELD]:
+            if not words[System.HELD]:
                 self._check_begun(entry)
         if wait:
             self._await_end(entry, timeout_s)
         return {**self._document(entry), "message": self._state(entry)}
 
     def withdraw(self, number: int) -> Document:
-        """Withdraw a fault that waits for its tick or condition; return it as plain data. Raises
-        `Failure`.
+        """Withdraw a fault that waits for its tick or condition, and return it as plain data.
+
+        Raises:
+            Failure: The fault is not waiting, or begins before it can be withdrawn.
         """
         waiting = {entry.index: entry for entry in self._table.staged((Stage.WAITING,))}
         if number not in waiting:
-            known = ", ".join(map(str, waiting)) or "none"
-            raise Failure(f"fault {number} is not waiting; waiting: {known}", 2)
+            waiting_numbers = ", ".join(map(str, waiting)) or "none"
+            raise Failure(f"fault {number} is not waiting; waiting: {waiting_numbers}", 2)
         entry = waiting[number]
         answer = self._document(entry)
         self._table.disarm(entry)
         words = self._segment.words
         tick = words[System.TICK]
-        # A clock that is held begins nothing.
+        # Wait for a tick that cannot begin the fault any more. A held clock begins no fault.
         self._wait_until(lambda: words[System.TICK] > tick + 1 or words[System.HELD] > 0, BEGIN_S)
         if not self._table.free(entry):
             raise Failure(f"{self._described(entry)}: it had begun before it could be withdrawn")
@@ -101,7 +111,7 @@ class LiveRack:
         return [self._document(entry) for entry in injected]
 
     def text(self) -> Iterator[str]:
-        """Yield the faults injected so far, as a table."""
+        """Yield the lines of a table of the faults injected so far."""
         columns = {
             "no": "fault",
             "fault": "text",
@@ -115,19 +125,24 @@ class LiveRack:
         rows = [[_cell(fault[key]) for key in columns.values()] for fault in self.faults()]
         return fitted(list(columns), rows)
 
-    def _fault(self, given: Document) -> FaultConfig:
-        """Return a fault as in a config. Raises `ConfigError`."""
+    def _fault(self, settings: Document) -> FaultConfig:
+        """Validate the keys of a fault. Raises `ConfigError`."""
         # Two faults of one run must not draw the same random numbers.
-        given.setdefault("seed", (self._config.seed + self._segment.words[System.INJECTED]) % SEEDS)
+        settings.setdefault(
+            "seed", (self._config.seed + self._segment.words[System.INJECTED]) % SEEDS
+        )
         try:
-            # A command line holds text: numbers are read from it, as they are not from a config.
-            return FaultConfig.model_validate(given, strict=False)
+            # Values from a command line are texts, so let numbers be converted from text.
+            return FaultConfig.model_validate(settings, strict=False)
         except ValidationError as error:
-            raise ConfigError(mistakes_of(error, FaultConfig, given)) from None
+            raise ConfigError(mistakes_of(error, FaultConfig, settings)) from None
 
     def _check(self, fault: FaultConfig) -> None:
-        """Refuse a fault that a running rack, or this process, cannot have. Raises `ConfigError`,
-        `Failure`.
+        """Check that a running rack, and this process, can have a fault.
+
+        Raises:
+            ConfigError: The fault cannot begin in a running rack, or lacks an end.
+            Failure: This process may not take a core.
         """
         tick = self._segment.words[System.TICK]
         where = KINDS[fault.kind].where
@@ -151,7 +166,7 @@ class LiveRack:
         set_priority(0)
 
     def _wait_until(self, holds: Callable[[], bool], timeout_s: float | None) -> bool:
-        """Wait until a condition holds, or the run is over; return False after `timeout_s`."""
+        """Wait until a condition holds or the run is over. Return False after `timeout_s`, s."""
         deadline = math.inf if timeout_s is None else time.monotonic() + timeout_s
         while not holds() and not self._segment.run_is_over:
             if time.monotonic() > deadline:
@@ -160,8 +175,10 @@ class LiveRack:
         return True
 
     def _await_end(self, entry: FaultEntry, timeout_s: float | None) -> None:
-        """Wait until a fault, or the run, is over. Raises `Failure` after `timeout_s`, or when it
-        never began.
+        """Wait until a fault, or the run, is over.
+
+        Raises:
+            Failure: `timeout_s` is over, or the run has ended before the fault began.
         """
         self._print_waiting(entry)
         if not self._wait_until(lambda: entry.stage == Stage.OVER, timeout_s):
@@ -169,22 +186,25 @@ class LiveRack:
         self._check_begun(entry)
 
     def _print_waiting(self, entry: FaultEntry) -> None:
+        """Print that a fault waits, if it does."""
         if entry.stage == Stage.WAITING:
             print(self._state(entry), file=sys.stderr, flush=True)
 
     def _check_begun(self, entry: FaultEntry) -> None:
+        """Raise `Failure` if the run has ended before a fault began."""
         if entry.stage == Stage.WAITING:
             raise Failure(f"{self._described(entry)}: the run ended before it began")
 
     def _state(self, entry: FaultEntry) -> str:
+        """Describe a fault and its state in one line."""
         fault = self._described(entry)
         first = entry.tick
         last = entry.until - 1
         if entry.stage == Stage.WAITING:
             how = f"to withdraw it: rack inject {self._segment.rack} --withdraw {entry.index}"
             awaited = self._awaited(entry)
-            held = waits(self._segment) if awaited == NEXT_TICK else ""
-            return f"{fault}: armed, {held or f'waits for {awaited}'}; {how}"
+            hold_text = waits(self._segment) if awaited == NEXT_TICK else ""
+            return f"{fault}: armed, {hold_text or f'waits for {awaited}'}; {how}"
         if entry.stage == Stage.OVER:
             acted = "once" if entry.count == 1 else f"{entry.count} times"
             return f"{fault}: ticks {first} to {last}, acted {acted}"
@@ -192,24 +212,25 @@ class LiveRack:
         return f"{fault}: from tick {first} to {end}"
 
     def _awaited(self, entry: FaultEntry) -> str:
-        """Return the tick or the condition that a fault waits for."""
+        """Return the tick or the condition for which a fault waits."""
         if entry.when_box < 0:
             if entry.tick <= 0:
                 return NEXT_TICK
-            now = self._segment.words[System.TICK]
-            return f"tick {entry.tick}; the rack is at tick {now}"
+            tick = self._segment.words[System.TICK]
+            return f"tick {entry.tick}; the rack is at tick {tick}"
         when = (entry.when_box, entry.when_field, entry.when_value)
         return condition_text(when, self._segment.layout)
 
     def _document(self, entry: FaultEntry) -> Document:
-        """Return a fault as plain data; `waits_for` is empty once it has begun."""
+        """Return a fault as plain data. `waits_for` is empty once it has begun."""
         waits_for = self._awaited(entry) if entry.stage == Stage.WAITING else ""
         return {**document(entry, self._segment.layout, self._joints), "waits_for": waits_for}
 
     def _described(self, entry: FaultEntry) -> str:
+        """Describe a fault in one line."""
         return describe(entry, self._segment.layout, self._joints)
 
 
 def _cell(value: str | int | None) -> str:
-    """Return a cell of the table of faults: "-" for a tick that is not known."""
+    """Return a cell of the table of faults: "-" for an unknown tick."""
     return "-" if value is None or value == -1 else str(value)

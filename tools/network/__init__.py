@@ -1,1 +1,1 @@
-"""The emergency stop of racks on other machines, and credentials of racks that work together."""
+"""Emergency stop of racks on other machines, and credentials for racks on a network."""

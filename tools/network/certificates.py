@@ -1,7 +1,7 @@
-"""Making of credentials: an authority, and a certificate and key for each rack.
+"""Creation of credentials: an authority, and a certificate and key for each rack.
 
-The keys are on the curve P-256, which every TLS library knows, and which the seals need. A
-certificate serves both sides of a connection: racks listen and connect.
+Keys are on the curve P-256, which every TLS library supports and which the seals require. A
+certificate is valid for both sides of a connection, because racks both listen and connect.
 """
 
 from __future__ import annotations
@@ -36,32 +36,39 @@ from rack.tools.console.answer import Failure
 AUTHORITY_KEY = "authority-key.pem"
 AUTHORITY_NAME = "rack test authority"
 EARLIER = timedelta(hours=1)
-"""A certificate is valid from this long ago: machines' clocks differ."""
+"""Certificates are valid from this long ago, because the clocks of machines differ."""
 
 
 @dataclass(frozen=True)
 class Made:
-    """What was made: files by name, and when the certificates expire."""
+    """Content of the files that were made, by name, and the time when the certificates expire."""
 
     files: Mapping[str, bytes]
     expires: datetime
 
 
 class Authority(NamedTuple):
-    """The certificate of an authority, and its key."""
+    """Certificate and private key of an authority."""
 
     certificate: x509.Certificate
     key: ec.EllipticCurvePrivateKey
 
 
 def make_credentials(folder: Path, names: Mapping[str, Sequence[str]], days: int) -> Made:
-    """Write a certificate and key for each name with its addresses; a new authority, if there
-    is none.
+    """Write a certificate and a key for each name. Create the authority if the folder has none.
 
-    Raises `Failure`: a file is there already, or the authority there cannot be used.
+    Args:
+        folder: Folder for the files.
+        names: Host names and addresses of each rack, by its name. Empty for a rack or an operator
+            that only connects.
+        days: Validity of the certificates in days, at most until the authority's certificate
+            expires.
+
+    Raises:
+        Failure: A file exists already, or the authority in the folder cannot be used.
     """
     wanted = [Credentials(folder, name) for name in names]
-    pairs = [path for own in wanted for path in (own.certificate, own.key)]
+    pairs = [path for rack in wanted for path in (rack.certificate, rack.key)]
     if taken := [path.name for path in pairs if os.path.lexists(path)]:
         raise Failure(f"{folder}: {', '.join(taken)} exist already; nothing is overwritten", 2)
     files: dict[str, bytes] = {}
@@ -73,16 +80,16 @@ def make_credentials(folder: Path, names: Mapping[str, Sequence[str]], days: int
         authority = Authority(sign_certificate(AUTHORITY_NAME, key, None, expires), key)
         files |= {AUTHORITY: pem_of(authority.certificate), AUTHORITY_KEY: pem_of_key(key)}
     expires = min(expires, authority.certificate.not_valid_after_utc)
-    for own, addresses in zip(wanted, names.values(), strict=True):
+    for rack, addresses in zip(wanted, names.values(), strict=True):
         key = ec.generate_private_key(ec.SECP256R1())
-        certificate = sign_certificate(own.rack, key, authority, expires, addresses)
-        files |= {own.certificate.name: pem_of(certificate), own.key.name: pem_of_key(key)}
+        certificate = sign_certificate(rack.rack, key, authority, expires, addresses)
+        files |= {rack.certificate.name: pem_of(certificate), rack.key.name: pem_of_key(key)}
     write_credentials(folder, files)
     return Made(files, expires)
 
 
 def _load_authority(folder: Path) -> Authority:
-    """Return the authority of a set. Raises `Failure`."""
+    """Return the authority in a folder. Raises `Failure` if it cannot be used."""
     try:
         certificate, *_ = load_certificates(folder / AUTHORITY)
         key = load_private_key(folder / AUTHORITY_KEY)
@@ -100,18 +107,19 @@ def sign_certificate(
     expires: datetime,
     addresses: Sequence[str] = (),
 ) -> x509.Certificate:
-    """Return a certificate.
+    """Return a signed certificate.
 
     Args:
-        name: Its common name.
-        key: The key that it certifies.
-        authority: The authority that signs it. None: it is that of a new authority.
-        expires: Its end.
-        addresses: The host names and addresses of a rack that listens.
+        name: Common name of the certificate.
+        key: Private key that belongs to it.
+        authority: Authority that signs it. None for the certificate of a new authority, which signs
+            itself.
+        expires: End of its validity.
+        addresses: Host names and addresses of a rack that listens.
     """
-    own = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
+    subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
     is_authority = authority is None
-    issuer, signer = (own, key) if authority is None else (authority[0].subject, authority.key)
+    issuer, signer = (subject, key) if authority is None else (authority[0].subject, authority.key)
     usage = x509.KeyUsage(
         digital_signature=not is_authority,
         content_commitment=False,
@@ -125,7 +133,7 @@ def sign_certificate(
     )
     builder = (
         x509.CertificateBuilder()
-        .subject_name(own)
+        .subject_name(subject)
         .issuer_name(issuer)
         .public_key(key.public_key())
         .serial_number(x509.random_serial_number())
@@ -145,6 +153,7 @@ def sign_certificate(
 
 
 def _address(text: str) -> x509.GeneralName:
+    """Return an address, or a host name, as an alternative name of a certificate."""
     try:
         return x509.IPAddress(ip_address(text))
     except ValueError:
@@ -152,20 +161,20 @@ def _address(text: str) -> x509.GeneralName:
 
 
 def pem_of(certificate: x509.Certificate) -> bytes:
-    """Return a certificate as the content of its file."""
+    """Return a certificate in PEM form."""
     return certificate.public_bytes(Encoding.PEM)
 
 
 def pem_of_key(key: ec.EllipticCurvePrivateKey) -> bytes:
-    """Return a key as the content of its file."""
+    """Return a private key in PEM form, without a password."""
     return key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
 
 
 def write_credentials(folder: Path, files: Mapping[str, bytes]) -> None:
-    """Write files by name into a folder, which is made if it does not exist."""
+    """Write files by name into a folder, which is created if necessary."""
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     for name, content in files.items():
-        # Its owner's from the first moment on, and never through a link that somebody left.
+        # Create the file with its final mode, and never follow a link that somebody has left.
         fd = os.open(
             folder / name, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, OWNER_ONLY
         )
@@ -174,17 +183,22 @@ def write_credentials(folder: Path, files: Mapping[str, bytes]) -> None:
 
 
 def named_addresses(entries: Iterable[str]) -> dict[str, list[str]]:
-    """Return the addresses by name from texts as in cell=10.0.0.1,cell.local or operator. Raises
-    `Failure`.
+    """Parse the values of `--for`, such as "cell=10.0.0.1,cell.local" or "operator".
+
+    Returns:
+        The addresses of each name.
+
+    Raises:
+        Failure: A name or an address is malformed, or a name is repeated.
     """
-    found: dict[str, list[str]] = {}
+    addresses_by_name: dict[str, list[str]] = {}
     for entry in entries:
         name, has_addresses, rest = entry.partition("=")
         addresses = rest.split(",") if has_addresses else []
         why = ""
         if re.fullmatch(RACK_NAME, name) is None:
-            why = "permitted names: a-z, 0-9, _ and -, at most 40"
-        elif name in found:
+            why = "a name consists of at most 40 of the characters a-z, 0-9, _ and -"
+        elif name in addresses_by_name:
             why = f"{name} is named twice"
         elif name == "authority" or name.endswith("-key"):
             why = "a file of the set would have this name"
@@ -192,8 +206,8 @@ def named_addresses(entries: Iterable[str]) -> dict[str, list[str]]:
             for address in addresses:
                 Endpoint.of(f"tls/{f'[{address}]' if ':' in address else address}:1")
         except ValueError:
-            why = why or "permitted: NAME, or NAME=ADDRESS,... with host names or addresses"
+            why = why or "it must be NAME or NAME=ADDRESS,... with host names or addresses"
         if why:
             raise Failure(f'--for = "{entry}": {why}', 2)
-        found[name] = addresses
-    return found
+        addresses_by_name[name] = addresses
+    return addresses_by_name

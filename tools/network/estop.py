@@ -1,7 +1,7 @@
-"""The emergency stop of a rack on another machine.
+"""Emergency stop of a rack on another machine.
 
-A session with the racks at its host, which listens nowhere. A request is repeated until it is
-answered or `PATIENCE_S` is over: a rack that gets many drops some.
+The operator's session connects to the racks at one host and does not listen. A rack that receives
+many requests drops some, so a request is repeated until it is answered or `PATIENCE_S` is over.
 """
 
 from __future__ import annotations
@@ -27,25 +27,30 @@ from rack.tools.console.address import Operator, RackAddress
 from rack.tools.console.answer import Failure
 
 CONNECT_S = 3.0
-"""Longest wait for a connection, and for the racks at its other end to show themselves."""
+"""Maximum wait for a connection and for the first rack at its other end."""
 OTHERS_S = 0.3
-"""Longest wait for further racks at the other end of a connection, once one has shown itself."""
+"""Maximum wait for further racks at the other end once one was seen."""
 ANSWER_S = 1.0
-"""Longest wait for one answer; after it the request is repeated."""
+"""Maximum wait for an answer. After that the request is repeated."""
 PATIENCE_S = 4.0
 """Time without an answer after which a rack counts as gone."""
 PAUSE_S = 0.02
-"""Time until a request is repeated that was dropped, and between two looks at who is there."""
+"""Interval between two requests, and between two checks for racks."""
 DENIED_S = 1.0
-"""Time for which all requests come back at once without an answer until that counts as not
-permitted: the way to a rack that has just shown itself may not be there yet."""
+"""Time after which requests that return at once without an answer count as not permitted.
+
+The path to a rack that has just appeared may not exist yet, so the first such return proves
+nothing.
+"""
 LOOK_S = 0.2
-"""Time between two looks at whether a rack is still there."""
+"""Interval at which the presence of a rack is checked."""
 
 
 class EstopSession:
-    """A session at one host, in a context. Raises `Failure` when nobody is there, or it refuses
-    this operator.
+    """Session of an operator at one host, used as a context manager.
+
+    Raises:
+        Failure: Nothing listens at the host, or it refuses this operator.
     """
 
     def __init__(self, address: RackAddress, operator: Operator) -> None:
@@ -71,7 +76,7 @@ class EstopSession:
         self._link.close()
 
     def _await(self, condition: Callable[[], object], bound_s: float) -> None:
-        """Note who comes and goes, until a condition holds or the time is over."""
+        """Follow which racks are present until a condition holds or `bound_s` seconds are over."""
         end_s = time.monotonic() + bound_s
         while True:
             for rack, launch, is_there in self._changes():
@@ -84,38 +89,41 @@ class EstopSession:
             time.sleep(PAUSE_S)
 
     def launch(self) -> int:
-        """Return the number of the rack's launch. Raises `Failure` when it is not there: it names
-        those that are.
+        """Return the number of the rack's launch.
+
+        Raises:
+            Failure: The rack is not present. The message names the racks that are.
         """
         rack = self._address.rack
         self._await(lambda: self._launches, CONNECT_S)
         self._await(lambda: rack in self._launches, OTHERS_S)
         if rack in self._launches:
             return self._launches[rack]
-        there = ", ".join(sorted(self._launches))
+        present = ", ".join(sorted(self._launches))
         with_tls = "one with TLS needs --certificates"
         if self._operator.certificates:
             with_tls = "its certificate and yours must be of one authority"
         nobody = f"none that knows '{self._operator.name}'; {with_tls}"
-        raise Failure(f"no rack '{rack}' at {self._address.at}; racks there: {there or nobody}")
+        raise Failure(f"no rack '{rack}' at {self._address.at}; racks there: {present or nobody}")
 
     def set_stop(self, launch: int, flags: int = 0) -> int:
-        """Set the emergency stop of the rack, or with `CHECK` find out whether it would be set.
+        """Set the emergency stop of the rack, or check whether it could be set.
 
         Args:
-            launch: Number of the rack's launch: a restarted rack is another one.
-            flags: 0, or `CHECK`.
+            launch: Number of the rack's launch. A restarted rack has another number.
+            flags: 0 to set the stop, or `CHECK_FLAG` to check only.
 
         Returns:
             The tick at which the rack answered.
 
         Raises:
-            Failure: It has ended, does not permit it, or does not answer.
+            Failure: The rack has ended, does not permit the stop, or does not answer.
         """
         rack = self._address.rack
-        at = f"rack '{rack}' at {self._address.at}"
+        rack_text = f"rack '{rack}' at {self._address.at}"
         first_s = time.monotonic()
-        was_taken = False  # by the rack, at least once: its adapter answers in its next cycle
+        # Whether the rack has accepted a request, which its adapter answers in its next cycle.
+        was_taken = False
         while True:
             began_s = time.monotonic()
             if (tick := self._request(launch, flags)) is not None:
@@ -124,19 +132,19 @@ class EstopSession:
             was_taken |= now_s - began_s > ANSWER_S / 2
             self._await(lambda: True, 0.0)
             if self._launches.get(rack) != launch:
-                raise Failure(f"{at} has ended, or is out of reach")
+                raise Failure(f"{rack_text} has ended, or is out of reach")
             if not was_taken and now_s - first_s > DENIED_S:
                 raise Failure(
-                    f"rack '{rack}' does not permit '{self._operator.name}' to stop it; its"
-                    " config: adapter.lan.estop_from"
+                    f"rack '{rack}' does not permit '{self._operator.name}' to stop it;"
+                    " name it in adapter.lan.estop_from of the rack's config"
                 )
             if now_s - first_s > PATIENCE_S:
                 why = "its adapter does not cycle; does `rack step` hold it?"
-                raise Failure(f"{at} has not answered for {PATIENCE_S:g} s: {why}")
+                raise Failure(f"{rack_text} has not answered for {PATIENCE_S:g} s: {why}")
             time.sleep(PAUSE_S)
 
     def _request(self, launch: int, flags: int) -> int | None:
-        """Send a request once; return the tick of its answer, or None if there is none."""
+        """Send a request once. Return the tick of its answer, or None if there is none."""
         rack, name, sealer = self._address.rack, self._operator.name, self._link.sealer
         self._number += 1
         key = estop_key(name, rack)
@@ -154,15 +162,17 @@ class EstopSession:
             _, envelope, payload = Arrived.of(reply.ok)
             answer = sealer.opened(estop_answer_key(rack, name), envelope, payload)
             expected = launch, self._number, self._session
-            # Launch, serial and number: it cannot be the answer to another request.
+            # Compare launch, serial and number, so that an answer to another request is ignored.
             if not isinstance(answer, Flaw) and answer[1:4] == expected:
                 return answer.tick
         return None
 
 
 def stop(address: RackAddress, operator: Operator) -> int:
-    """Set the emergency stop of a rack; return the tick at which that was done. Raises
-    `Failure`.
+    """Set the emergency stop of a rack and return the tick at which it was set.
+
+    Raises:
+        Failure: The stop could not be set.
     """
     with EstopSession(address, operator) as session:
         return session.set_stop(session.launch())
@@ -174,32 +184,32 @@ def stop_when(
     operator: Operator,
     tell: Callable[[str], None],
 ) -> int:
-    """Stay connected to a rack, and set its emergency stop when it is demanded.
+    """Stay connected to a rack and set its emergency stop on demand.
 
-    What is demanded while the rack is out of reach is tried until it is set.
+    A demand while the rack is out of reach is repeated until the stop is set.
 
     Args:
-        pressed: Waits up to a time in s; returns True once the stop is demanded.
-        address: The rack.
-        operator: Who sets the stop.
-        tell: Gets, again and again, whether the stop could be set.
+        pressed: Waits up to a time in s. Returns True once the stop is demanded.
+        address: Address of the rack.
+        operator: Name and certificates of whoever sets the stop.
+        tell: Called repeatedly with a text that says whether the stop can be set.
 
     Returns:
-        The tick at which it was set.
+        The tick at which the stop was set.
 
     Raises:
-        Failure: It could not be set from the beginning.
+        Failure: The stop could not be set from the beginning.
     """
     with EstopSession(address, operator) as session:
-        checked: int | None = None
-        while checked is None or not pressed(LOOK_S):
+        checked_launch: int | None = None
+        while checked_launch is None or not pressed(LOOK_S):
             try:
-                if (launch := session.launch()) != checked:
+                if (launch := session.launch()) != checked_launch:
                     session.set_stop(launch, CHECK)
-                    checked = launch
+                    checked_launch = launch
                 tell(f"ready to stop rack '{address}'")
             except Failure as failure:
-                if checked is None:
+                if checked_launch is None:
                     raise
                 tell(f"not ready: {failure}")
         while True:
@@ -210,18 +220,28 @@ def stop_when(
 
 
 def check_reach(rack: RackAddress, operator: Operator) -> None:
-    """Raise `Failure` when nobody listens there, or this operator has no certificate to show."""
-    at = rack.at
+    """Check that a rack can be reached.
+
+    Raises:
+        Failure: Nothing listens there, or the operator has no usable certificate but needs one.
+    """
+    host_text = rack.at
     try:
         with socket.create_connection((rack.host.strip("[]"), rack.port), CONNECT_S) as connection:
             address = ipaddress.ip_address(connection.getpeername()[0].partition("%")[0])
     except TimeoutError:
-        raise Failure(f"{at}: no answer at port {rack.port} within {CONNECT_S:g} s") from None
+        raise Failure(
+            f"{host_text}: no answer at port {rack.port} within {CONNECT_S:g} s"
+        ) from None
     except OSError as error:
-        raise Failure(f"{at}: cannot connect to port {rack.port}: {error.strerror}") from None
+        raise Failure(
+            f"{host_text}: cannot connect to port {rack.port}: {error.strerror}"
+        ) from None
     if operator.certificates:
         credentials = Credentials(Path(operator.certificates), operator.name)
         if (flaw := next(credentials.flaws(), None)) is not None:
             raise Failure(str(flaw))
     elif not address.is_loopback:
-        raise Failure(f"{at}: not this machine, so it needs certificates; see --certificates", 2)
+        raise Failure(
+            f"{host_text} is another machine, so a stop needs certificates; see --certificates", 2
+        )

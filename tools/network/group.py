@@ -1,4 +1,4 @@
-"""`rack lan`: what racks on a network need before they run."""
+"""`rack lan`: preparation of racks for a network."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ YEAR = 365
 
 @app.callback()
 def lan() -> None:
-    """Prepare racks that work together over a network."""
+    """Prepare racks for working together over a network."""
 
 
 @app.command()
@@ -32,23 +32,23 @@ def certificates(
 ) -> None:
     r"""Make a set of certificates for tests: an authority, and a pair for each name.
 
-    Racks know each other by name: the common name of a certificate is the name of the rack, and
-    what a rack may send and read depends on it. Give a rack that listens the addresses or host
-    names that stand in the others' `connect`: they check them. One that only connects, or a person
-    who uses `rack estop HOST/RACK`, needs none.
+    The common name of a certificate is the name of the rack. It determines what the rack may send
+    and read. For a rack that listens, give the addresses or host names that other racks use in
+    `connect`, because they check them. A rack that only connects, or a person who uses
+    `rack estop HOST/RACK`, needs none.
 
-    In DIR it writes authority.pem and authority-key.pem, and NAME.pem and NAME-key.pem for each
-    name. NAME's key seals all its messages, and nobody else can. In a folder that holds a set
-    already, it adds names to it. It never overwrites.
+    The command writes authority.pem and authority-key.pem into DIR, and NAME.pem and NAME-key.pem
+    for each name. The key of NAME seals all messages of NAME. If DIR already contains a set, the
+    names are added to it. No file is overwritten.
 
     A config names the folder in [adapter.lan]: certificates = "DIR", relative to the config. Each
     machine needs only authority.pem and its own pair. Keys must be readable by their owner alone.
 
-    It is a set for tests: one folder holds the keys of all. Where it matters, have your own
-    authority sign certificates with the same names, from keys on the curve P-256 that never leave
-    their machines.
+    The set is for tests, because one folder contains the keys of all racks. If security matters,
+    let your own authority sign certificates with the same names, for keys on the curve P-256 that
+    never leave their machines.
 
-    Exit status: 0 made, 2 nothing was made.
+    Exit status: 0 if the set was made, 2 if nothing was made.
 
     \b
     Examples:
@@ -62,21 +62,18 @@ def certificates(
             "certificates are made with 'cryptography', which is missing: install nasrem-rack[lan]"
         ) from None
     by_name = named_addresses(names)
-    made = make_credentials(folder, by_name, days)
+    credentials = make_credentials(folder, by_name, days)
     answer = {
         "folder": str(folder),
-        "made": list(made.files),
+        "made": list(credentials.files),
         "names": by_name,
-        "expires": made.expires.isoformat(timespec="seconds"),
+        "expires": credentials.expires.isoformat(timespec="seconds"),
     }
     first = next(iter(by_name))
     lines = [
-        f"made in {folder}: {', '.join(made.files)}",
-        f"valid until {made.expires:%Y-%m-%d}",
-        "A set for tests: whoever has this folder can pass for any of these racks.",
-        (
-            f"Each machine needs only authority.pem and its own pair, as in {first}.pem and"
-            f" {first}-key.pem."
-        ),
+        f"made in {folder}: {', '.join(credentials.files)}",
+        f"valid until {credentials.expires:%Y-%m-%d}",
+        "This set is for tests: whoever has the folder can act as any of these racks.",
+        f"Each machine needs only authority.pem and one pair: {first}.pem and {first}-key.pem.",
     ]
     print_answer(answer, lines, as_json)

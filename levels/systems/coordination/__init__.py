@@ -1,6 +1,4 @@
-"""Task levels of several racks that work together: one that takes its actions as orders, and one
-that gives them.
-"""
+"""Task levels of several racks that work together: a coordinator and arms that take its orders."""
 
 from rack.levels.systems.coordination.coordinator import Coordinator
 from rack.levels.systems.coordination.ordered_task import OrderedTaskExecutor, OrderedTaskPlanner

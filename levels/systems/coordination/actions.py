@@ -1,4 +1,4 @@
-"""Actions of a task program as fields of a message, and back."""
+"""Conversion between actions of a task program and fields of a message."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _ACTION: TypeAdapter[AnyAction] = TypeAdapter(AnyAction)
 
 
 def write_action(action: AnyAction, message: CellAction) -> None:
-    """Fill the `CellAction` of a message; what the action lacks is zero."""
+    """Write an action into the `CellAction` of a message. Fields that it lacks become zero."""
     for field in CellAction.message_type.fields:
         message.record[field.name] = np.zeros((), message.record.dtype[field.name])
     message.by = action.by or 0.0
@@ -47,31 +47,33 @@ def write_action(action: AnyAction, message: CellAction) -> None:
 
 
 def copy_action(source: CellAction, target: CellAction) -> None:
-    """Copy the `CellAction` from one message to another."""
+    """Copy the `CellAction` of one message to another."""
     for field in CellAction.message_type.fields:
         target.record[field.name] = source.record[field.name]
 
 
 def read_action(message: CellAction, context: LevelContext) -> AnyAction:
-    """Return the action in the `CellAction` of a message. Raises `ProgramError`: it does not
-    suit arm or scene.
+    """Return the action in the `CellAction` of a message.
+
+    Raises:
+        ProgramError: The action is malformed, or does not suit the arm or the scene.
     """
     try:
         action: AnyAction = _ACTION.validate_python({**_table(message), "by": message.by or None})
     except ValidationError as error:
         lines = [f"{'.'.join(map(str, entry['loc']))}: {entry['msg']}" for entry in error.errors()]
         raise ProgramError("\n".join(lines)) from error
-    if found := [
+    if mistakes := [
         f"{key} = {value!r}: {why}"
         for key, value, why in misfits(action, context.robot, context.scene)
     ]:
-        raise ProgramError("\n".join(found))
+        raise ProgramError("\n".join(mistakes))
     return action
 
 
 def _table(message: CellAction) -> dict[str, Any]:
-    """Return the action, but for its `by`, as a table of a program."""
-    place = message.position.tolist()
+    """Return the action as a table of a program, without its `by`."""
+    position = message.position.tolist()
     match message.action, message.goal:
         case OrderAction.HOME, _:
             return {"do": "home"}
@@ -80,16 +82,16 @@ def _table(message: CellAction) -> dict[str, Any]:
             return {
                 "do": "transfer",
                 "object": message.object,
-                "to": place,
+                "to": position,
                 "lift": message.lift,
                 "yaw": yaw,
             }
         case OrderAction.GOTO, Goal.JOINTS:
             return {"do": "goto", "joints": message.joints[: message.count].tolist()}
         case OrderAction.GOTO, Goal.POSE:
-            return {"do": "goto", "position": place, "quaternion": message.quaternion.tolist()}
+            return {"do": "goto", "position": position, "quaternion": message.quaternion.tolist()}
         case OrderAction.GOTO, Goal.DIRECTION:
-            return {"do": "goto", "position": place, "direction": message.direction.tolist()}
+            return {"do": "goto", "position": position, "direction": message.direction.tolist()}
     raise ProgramError(
         f"action {message.action} with goal {message.goal} is not known; permitted: transfer, goto,"
         " home"

@@ -1,21 +1,22 @@
-"""The agreement on each step between a coordinator and its arms.
+"""Agreement between a coordinator and its arms about each step of a program.
 
-A step is asked of all its arms. Once each has answered POSSIBLE, all are told to do it; if one
-refuses, all are ended. An answer holds until it says otherwise, so the step begins everywhere or
-nowhere, however long messages take. An answer with a time may come too late to be acted on: then
-all are cancelled, and asked again.
+The coordinator asks all arms of a step. Once every arm has answered POSSIBLE, it tells all of them
+to do the step. If one arm refuses, the program ends for all. An answer stays valid until the arm
+reports another one, so a step begins everywhere or nowhere, however long messages take. An answer
+may expire at a given time. If the order would arrive too late for one, the step is cancelled for
+all arms and asked again.
 
-The id of an order names step and attempt. From what the arms report, a coordinator that remembers
-nothing, after a new launch of its rack, knows which step is under way, and whether it had been
-begun.
+The id of an order contains the step and the attempt. A coordinator that has lost its memory, after
+a new launch of its rack, therefore learns from the reports of the arms which step is active and
+whether it has begun.
 
-Both sides exchange whole states, never events, so a lost message only delays. What makes the arms
-begin together, or not at all:
+Both sides exchange complete states instead of events, so a lost message only causes a delay. Two
+rules ensure that the arms begin together or not at all:
 
-- An answer of an order is final: POSSIBLE turns into DOING by DO alone, into CANCELLED by CANCEL or
-  another order.
+- The answer to an order is final: POSSIBLE turns into DOING only by DO, and into CANCELLED only by
+  CANCEL or another order.
 - An arm begins nothing that it has not answered to be possible. After a new launch of its rack,
-  which knows of no promise, it fails what it is asked to do.
+  which knows of no promise, it fails an order to do something.
 """
 
 from __future__ import annotations
@@ -33,52 +34,67 @@ from rack.levels.systems.coordination.messages import (
 )
 
 ATTEMPTS = 1000
-"""Ids of orders for one step."""
+"""Number of order ids reserved for one step."""
 MAX_ATTEMPTS = 10
-"""Times that a step is asked for before the program ends."""
+"""Number of attempts after which the program ends."""
 NO = (Response.REFUSED, Response.FAILED)
 BROKEN_OFF = (Response.CANCELLED, Response.STOPPED, Response.ENDED)
 BEGUN = (Response.DOING, Response.DONE)
 VERBS = {Phase.ASKING: OrderVerb.ASK, Phase.DOING: OrderVerb.DO, Phase.CANCELLING: OrderVerb.CANCEL}
-"""What to say to the arms of a step."""
+"""Verb of the orders to the arms of the step, by phase."""
 KEPT = ("phase", "step", "attempt", "error", "reason", "ending", "begun")
-"""Attributes of an agreement that its `CellProgress` keeps."""
+"""Attributes of an agreement that are saved in `CellProgress`."""
 
 
 class Agreement:
-    """Steps through a program with several arms. `program`: its checksum; `steps`: the arms of each
-    step. The arms' answers are their `CellReport`s.
+    """Leads several arms through the steps of a program.
+
+    Attributes:
+        program: Checksum of the program.
+        phase: What the coordinator is doing.
+        step: Number of steps done.
+        attempt: How often the present step was asked for before.
+        error: Why the program ends early, or `Error.NONE`.
+        reason: The same as text.
+        begun: Simulated time at which every arm had reported, s: the origin of the program's times.
+            0 before that.
+        ending: Simulated time since when the arms are being ended, s. 0 before that.
     """
 
     def __init__(
         self, program: int, steps: Sequence[Collection[str]], margin_s: float, farewell_s: float
     ) -> None:
-        """`margin_s`: time in which an order reaches its arm; `farewell_s`: time that the arms have
-        to confirm the end.
+        """Create the agreement before its first step.
+
+        Args:
+            program: Checksum of the program.
+            steps: Arms of each step.
+            margin_s: Time that an order needs to reach its arm, s.
+            farewell_s: Time that the arms have to confirm the end, s.
         """
         self.program = program
         self._steps = steps
         self._margin_s = margin_s
         self._farewell_s = farewell_s
         self._arms = list(dict.fromkeys(arm for step in steps for arm in step))
-        self._answers: Mapping[str, Reading[CellReport]] = {}  # as of this cycle
-        self._now_s = 0.0  # likewise, simulated time
+        # Reports of the arms and simulated time of the present cycle.
+        self._answers: Mapping[str, Reading[CellReport]] = {}
+        self._now_s = 0.0
         self.phase = Phase.AWAITING
         self.step = 0
         self.attempt = 0
         self.error = Error.NONE
         self.reason = ""
-        # When every arm was there: the origin of the program's times, simulated time; 0: not yet
         self.begun = 0.0
-        self.ending = 0.0  # since when the arms are ended, simulated time; 0: not yet
+        self.ending = 0.0
 
     def recall(self, last: CellProgress) -> None:
-        """Continue from a `CellProgress`."""
+        """Continue from a saved state."""
         for name in KEPT:
             setattr(self, name, getattr(last, name))
 
     def write_to(self, progress: CellProgress) -> None:
-        """Fill a `CellProgress`, but for the count of moves."""
+        """Save the state in a `CellProgress`. Its count of moves is not written."""
         for name in KEPT:
             setattr(progress, name, getattr(self, name))
 
@@ -89,20 +105,25 @@ class Agreement:
 
     @property
     def partners(self) -> Collection[str]:
-        """The arms of the present step; none before the first and after the last one."""
+        """Arms of the present step. Empty before the first step and after the last one."""
         if self.phase not in VERBS or self.step >= len(self._steps):
             return ()
         return self._steps[self.step]
 
     def verb(self, arm: str) -> OrderVerb:
-        """Return what to say to an arm."""
+        """Return the verb of the present order to an arm."""
         if self.phase in (Phase.ENDING, Phase.OVER):
             return OrderVerb.END
         return VERBS[self.phase] if arm in self.partners else OrderVerb.NONE
 
     def advance(self, answers: Mapping[str, Reading[CellReport]], now_s: float) -> None:
-        """Take one step forward, if the answers allow it; be over once every arm has confirmed the
-        end, or had time to.
+        """Advance the program if the answers allow it.
+
+        The program is over once every arm has confirmed the end, or was given enough time for it.
+
+        Args:
+            answers: Newest report of each arm.
+            now_s: Simulated time, s.
         """
         self._answers = answers
         self._now_s = now_s
@@ -115,79 +136,90 @@ class Agreement:
         elif self.phase is Phase.CANCELLING:
             self._cancel()
         if self.phase is Phase.ENDING:
-            said = self._said(self._arms)
-            is_confirmed = all(response is Response.ENDED for response in said.values())
+            responses = self._said(self._arms)
+            is_confirmed = all(response is Response.ENDED for response in responses.values())
             if is_confirmed or now_s - self.ending > self._farewell_s:
                 self.phase = Phase.OVER
 
     def _said(self, arms: Collection[str]) -> dict[str, Response]:
-        """Return the answers of these arms to the present order."""
-        said = dict.fromkeys(arms, Response.NONE)
+        """Return the responses of these arms to the present order."""
+        responses = dict.fromkeys(arms, Response.NONE)
         for arm in arms:
             answer = self._answers[arm].message
             if (answer.program, answer.echo) == (self.program, self.order):
-                said[arm] = Response(answer.response)
-        return said
+                responses[arm] = Response(answer.response)
+        return responses
 
     def _are_there(self, arms: Collection[str]) -> bool:
-        """Return whether all these arms report, and none is lost."""
+        """Return True if all these arms report and none is lost."""
         answers = [self._answers[arm] for arm in arms]
         return all(answer.is_there and not answer.is_lost for answer in answers)
 
     def _await(self) -> None:
-        """Go on once every arm reports, with the step that the reports show, or with the end."""
+        """Wait until every arm reports, then continue at the step that the reports show.
+
+        If a report shows that the program has ended, end it here too.
+        """
         answers = [reading.message for reading in self._answers.values()]
-        ours = [answer for answer in answers if answer.program == self.program]
-        ended = [answer for answer in ours if answer.response == Response.ENDED]
-        newest = max([answer.echo for answer in ended or ours], default=0)
+        own_answers = [answer for answer in answers if answer.program == self.program]
+        ended_reports = [answer for answer in own_answers if answer.response == Response.ENDED]
+        newest = max([answer.echo for answer in ended_reports or own_answers], default=0)
         if newest // ATTEMPTS in range(1, len(self._steps) + 2):
             self.step = newest // ATTEMPTS - 1
             self.attempt = newest % ATTEMPTS
-        if ended:
-            self.end(Error(ended[0].error), ended[0].reason)
+        if ended_reports:
+            self.end(Error(ended_reports[0].error), ended_reports[0].reason)
         elif self._are_there(self._arms):
             self.begun = self._now_s
             self._go_on()
         if self.phase is Phase.ASKING:
-            # At once: an arm that has forgotten its promise must not be asked for it again.
+            # Evaluate the reports in this cycle already, so that an arm that has forgotten its
+            # promise is not asked again.
             self._ask()
 
     def _go_on(self) -> None:
+        """Start the next step, or end the program after the last one."""
         if self.step < len(self._steps):
             self.phase = Phase.ASKING
         else:
             self.end(Error.NONE, "")
 
     def _ask(self) -> None:
-        said = self._said(self.partners)
-        if self._ends_by(said, NO):
+        """Evaluate the answers to a question: do the step, cancel it, or end the program."""
+        responses = self._said(self.partners)
+        if self._ends_by(responses, NO):
             return
-        if any(response in BROKEN_OFF for response in said.values()):
+        if any(response in BROKEN_OFF for response in responses.values()):
             self.phase = Phase.CANCELLING
-        elif any(response in BEGUN for response in said.values()):
-            self.phase = Phase.DOING  # told so by a launch before this one
-        elif all(r is Response.POSSIBLE for r in said.values()) and self._are_there(said):
+        elif any(response in BEGUN for response in responses.values()):
+            # An earlier launch of this rack has told them to begin.
+            self.phase = Phase.DOING
+        elif all(
+            response is Response.POSSIBLE for response in responses.values()
+        ) and self._are_there(responses):
             arrives_s = self._now_s + self._margin_s
-            times = [self._answers[arm].message.until for arm in said]
+            times = [self._answers[arm].message.until for arm in responses]
             in_time = all(arrives_s <= until_s for until_s in times if until_s)
             self.phase = Phase.DOING if in_time else Phase.CANCELLING
 
     def _follow(self) -> None:
-        said = self._said(self.partners)
-        if self._ends_by(said, (*NO, *BROKEN_OFF)):
+        """Wait until all arms have done the step."""
+        responses = self._said(self.partners)
+        if self._ends_by(responses, (*NO, *BROKEN_OFF)):
             return
-        if all(response is Response.DONE for response in said.values()):
+        if all(response is Response.DONE for response in responses.values()):
             self.step += 1
             self.attempt = 0
             self._go_on()
 
     def _cancel(self) -> None:
-        said = self._said(self.partners)
-        if self._ends_by(said, NO):
+        """Wait until all arms have cancelled the step, then ask again or end the program."""
+        responses = self._said(self.partners)
+        if self._ends_by(responses, NO):
             return
-        if any(response not in (*BROKEN_OFF, Response.DONE) for response in said.values()):
+        if any(response not in (*BROKEN_OFF, Response.DONE) for response in responses.values()):
             return
-        begun = [arm for arm, response in said.items() if response is not Response.CANCELLED]
+        begun = [arm for arm, response in responses.items() if response is not Response.CANCELLED]
         self.attempt += 1
         if begun:
             why = f"step {self.step}: {begun[0]} had begun when it was cancelled"
@@ -198,13 +230,15 @@ class Agreement:
         else:
             self.phase = Phase.ASKING
 
-    def _ends_by(self, said: Mapping[str, Response], kinds: Collection[Response]) -> bool:
-        """End the program if an arm has given one of these answers; return whether it has."""
-        for arm, response in said.items():
-            if response in kinds:
+    def _ends_by(
+        self, responses: Mapping[str, Response], fatal_responses: Collection[Response]
+    ) -> bool:
+        """End the program and return True if an arm has given one of these responses."""
+        for arm, response in responses.items():
+            if response in fatal_responses:
                 answer = self._answers[arm].message
-                what = f"step {self.step} {response.name.lower()}: {arm}"
-                reason = f"{what}: {answer.reason}".removesuffix(": ")
+                event = f"step {self.step} {response.name.lower()}: {arm}"
+                reason = f"{event}: {answer.reason}".removesuffix(": ")
                 self.end(Error(answer.error) or Error.GIVEN_UP, reason)
                 return True
         return False
@@ -224,22 +258,30 @@ TAKEN = {
     OrderVerb.CANCEL: Response.CANCELLED,
     OrderVerb.END: Response.ENDED,
 }
-"""The response to an order that is new."""
+"""First response to a new order, by its verb."""
 NOT_PROMISED = "told to do what it has not promised: its rack was launched anew"
 
 
 class TakenOrder:
-    """One order at a time, by the checksum of its program and its id."""
+    """The order that an arm has taken, identified by the program's checksum and the order's id.
+
+    Attributes:
+        program: Checksum of the program. 0 if there is no order.
+        order: Id of the order. 0 if there is none.
+        response: Present response to it.
+        error: Why it was refused or failed, or why the program ends early.
+        reason: The same as text.
+        stops: Whether the order is being carried out and must be interrupted.
+    """
 
     def __init__(self, report: CellReport | None = None) -> None:
-        """Begin without an order, or with that of a `CellReport`, after a restart of the board."""
+        """Create it without an order or, after a restart of the board, from the last report."""
         self.program = 0
         self.order = 0
         self.response = Response.NONE
-        # Of a refusal, a failure, or a program that ends early.
         self.error = Error.NONE
         self.reason = ""
-        self.stops = False  # under way, and to be broken off
+        self.stops = False
         if report is not None and report.echo:
             self.program = report.program
             self.order = report.echo
@@ -250,17 +292,22 @@ class TakenOrder:
 
     @property
     def is_asked(self) -> bool:
-        """Whether an answer is due."""
+        """Whether the order still needs an answer."""
         return self.order > 0 and self.response is Response.NONE
 
     @property
     def is_under_way(self) -> bool:
-        """Whether the arm carries it out."""
+        """Whether the arm is carrying out the order."""
         return self.response is Response.DOING
 
     def hear(self, program: int, order: int, what: int, reason: str = "") -> None:
-        """Follow what the newest message says of an order: an `OrderVerb`, and why a program ends
-        early.
+        """Process the order in the newest message.
+
+        Args:
+            program: Checksum of the program.
+            order: Id of the order. 0 if there is none.
+            what: An `OrderVerb`.
+            reason: Why the program ends early. Used with END only.
         """
         if not order or what not in TAKEN or self.response is Response.ENDED:
             return
@@ -284,12 +331,18 @@ class TakenOrder:
             self.reason = NOT_PROMISED
 
     def fail(self, error: Error, reason: str) -> None:
-        """Refuse the order to which an answer is due, or end the one under way."""
+        """Refuse the order if it needs an answer, or let it fail if it is being carried out."""
         response = Response.REFUSED if self.is_asked else Response.FAILED
         self.answer(response, reason, error)
 
     def answer(self, response: Response, reason: str = "", error: Error = Error.GIVEN_UP) -> None:
-        """Answer the order; without a reason nothing is wrong."""
+        """Set the response to the order.
+
+        Args:
+            response: The response.
+            reason: What is wrong. Empty if nothing is.
+            error: Error code that is used if there is a reason.
+        """
         self.response = response
         self.reason = reason
         self.stops = False

@@ -1,5 +1,6 @@
-"""A task level whose actions are carried out by the task levels of other racks, and its program,
-`[task]`: steps, each with what one or more arms do in it at the same time.
+"""Task level that lets the task levels of other racks carry out its actions.
+
+Its program, `[task]`, consists of steps, in which one or more arms act at the same time.
 """
 
 from __future__ import annotations
@@ -43,19 +44,19 @@ ARM = Field(description="arm that does it")
 
 
 class ArmTransfer(Transfer):
-    """A transfer, by an arm."""
+    """Transfer that names its arm."""
 
     arm: ArmName = ARM
 
 
 class ArmGoto(Goto):
-    """A goto, by an arm."""
+    """Goto that names its arm."""
 
     arm: ArmName = ARM
 
 
 class ArmHome(Home):
-    """The way home, of an arm."""
+    """Motion to the home position that names its arm."""
 
     arm: ArmName = ARM
 
@@ -64,8 +65,9 @@ ArmAction = Annotated[ArmTransfer | ArmGoto | ArmHome, Field(discriminator="do")
 
 
 class CellStep(Table):
-    """`[[task.step]]`: actions that begin together, once every arm has answered that it can do its
-    own by its time.
+    """`[[task.step]]`: actions that begin together.
+
+    They begin once every arm has answered that it can do its action in time.
     """
 
     do: tuple[ArmAction, ...]
@@ -78,60 +80,62 @@ class CellStep(Table):
 
 
 class CellProgram(Program):
-    """A program for several arms: steps, each begun when the one before it is done."""
+    """A program for several arms. Each step begins when the one before it is done."""
 
     step: tuple[CellStep, ...] = Field((), max_length=MAX_STEPS)
     """steps, done in their order"""
 
     @property
     def checksum(self) -> int:
-        """A number that two different programs hardly share, above 0."""
+        """Positive number that differs, almost certainly, between two programs."""
         return zlib.crc32(self.model_dump_json().encode()) or 1
 
     def misfits(self, robot: RobotConfig | None, scene: SceneConfig) -> Misfits:
-        """Yield key, value and reason of steps without actions or with two for an arm, times that
-        do not rise, and what is too long for an order.
+        """Yield key, value and reason of each mistake.
+
+        Mistakes are steps without actions or with two actions of one arm, times that do not rise,
+        and names or joints that do not fit into an order.
         """
         latest = 0.0
         for k, step in enumerate(self.step):
             arms: set[str] = set()
             if not step.do:
-                yield f"step[{k}].do", [], "has no action; permitted: one or more"
+                yield f"step[{k}].do", [], "a step must have at least one action"
             for n, action in enumerate(step.do):
-                place = f"step[{k}].do[{n}]"
+                key = f"step[{k}].do[{n}]"
                 if action.arm in arms:
                     yield (
-                        f"{place}.arm",
+                        f"{key}.arm",
                         action.arm,
-                        "has another action in this step; permitted: one action per arm",
+                        "this arm already has an action in this step",
                     )
                 if action.by is not None and action.by <= latest:
                     yield (
-                        f"{place}.by",
+                        f"{key}.by",
                         action.by,
-                        f"an earlier step has {latest:g}; permitted: later than that",
+                        f"must be later than {latest:g}, the time of an earlier step",
                     )
-                # An order holds names and joints of limited length.
+                # The order message has limited space for names and joints.
                 if isinstance(action, ArmTransfer) and not (
                     action.object.isascii() and len(action.object) <= OBJECT_BYTES
                 ):
                     yield (
-                        f"{place}.object",
+                        f"{key}.object",
                         action.object,
-                        f"permitted in an order: at most {OBJECT_BYTES} ASCII characters",
+                        f"an order can contain at most {OBJECT_BYTES} ASCII characters",
                     )
                 if isinstance(action, ArmGoto) and len(action.joints or ()) > MAX_JOINTS:
                     yield (
-                        f"{place}.joints",
+                        f"{key}.joints",
                         list(action.joints or ()),
-                        f"permitted in an order: at most {MAX_JOINTS} joints",
+                        f"an order can contain at most {MAX_JOINTS} joints",
                     )
                 arms.add(action.arm)
             latest = max([latest, *(action.by or 0.0 for action in step.do)])
 
 
 class CoordinatorParams(Table):
-    """The arms that a coordinator orders about, and how long it waits for them."""
+    """The arms of a coordinator, and how long it waits for them."""
 
     arms: dict[ArmName, MailboxName] = Field(min_length=1)
     """mailbox with an arm's report, by the arm's name; its orders are in order_<name>"""
@@ -143,16 +147,17 @@ class CoordinatorParams(Table):
 
 
 class Coordinator(Executor):
-    """Has each step of its program carried out by all its arms, or by none.
+    """Lets each step of its program be carried out by all its arms or by none.
 
-    While an arm is lost, or an operator holds this level, the arms rest on their paths. `by` counts
-    from when every arm has reported: anew with each launch of this rack.
+    While an arm is lost, or an operator holds this level, the arms rest on their paths. The time
+    `by` of an action counts from the moment when every arm has reported, and starts again with each
+    launch of this rack.
     """
 
     last_progress = Input(CellProgress, "own.progress")
     operator = Input(OperatorCommand, "own.operator")
-    # The progress first: a board killed before it has written its orders writes them when it is
-    # back.
+    # The progress is written first: a board that is killed before it has written its orders will
+    # write them after its restart.
     progress = Output(CellProgress)
     status = Output(TaskStatus)
     commands = HOLDABLE
@@ -166,16 +171,19 @@ class Coordinator(Executor):
         self._steps = [step.actions for step in program.step]
         margin_s = 2.0 * context.period_s
         self._agreement = Agreement(program.checksum, self._steps, margin_s, self._table.farewell_s)
-        self._readings: Mapping[str, Reading[CellReport]] = {}  # of the arms, in this cycle
+        # Reports of the arms in this cycle.
+        self._readings: Mapping[str, Reading[CellReport]] = {}
         self._operated = Orders(self.commands)
         self._started = False
-        self._moves = 0  # moves of the steps done
-        self._stage: tuple[object, ...] = ()  # all that changes while the program goes on
-        self._moved_at = 0  # tick of the last such change
+        # Number of moves of the steps that are done.
+        self._moves = 0
+        # Everything that changes while the program advances, and the tick of the last change.
+        self._stage: tuple[object, ...] = ()
+        self._moved_at = 0
 
     @classmethod
     def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, type[Message]]) -> MadePorts:
-        """Return the orders and the report of each arm."""
+        """Return the ports for the orders to each arm and for its reports."""
         try:
             arms = CoordinatorParams.model_validate(params).arms
         except ValidationError:
@@ -187,25 +195,31 @@ class Coordinator(Executor):
     def misfits(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Misfits:
-        """Yield arms of the program that the parameters lack."""
-        known = read_params(CoordinatorParams, context.params).arms
+        """Yield arms of the program that the parameters lack.
+
+        Args:
+            context: Context of this level.
+            above: Contexts of the levels above. Not used.
+            below: Contexts of the levels below. Not used.
+        """
+        known_arms = read_params(CoordinatorParams, context.params).arms
         for k, step in enumerate(CellProgram.model_validate(context.task).step):
             for n, action in enumerate(step.do):
-                if action.arm not in known:
+                if action.arm not in known_arms:
                     why = f"lacks '{action.arm}', the arm of task.step[{k}].do[{n}]"
-                    yield "params.arms", ", ".join(known), why
+                    yield "params.arms", ", ".join(known_arms), why
 
     def process(self, tick: int) -> None:
-        """Read what the arms report, go on with the program, order what is next."""
+        """Read the reports of the arms, advance the program, and write the orders."""
         if not self._started:
-            # Continue from the last progress in the mailbox, after a restart of the board.
+            # After a restart of the board, continue from the last progress in the mailbox.
             self._started = True
             if self.last_progress.is_there:
                 self._agreement.recall(self.last_progress.message)
                 self._moves = self.last_progress.message.moves
         self._operated.take(self.operator)
         self._readings = {arm: self.ports[f"report_{arm}"] for arm in self._table.arms}
-        held = self._reason_to_hold()
+        hold_reason = self._reason_to_hold()
         if self._steps:
             agreement = self._agreement
             step = agreement.step
@@ -213,24 +227,27 @@ class Coordinator(Executor):
             agreement.advance(self._readings, tick * self.context.tick_s)
             if agreement.step > step:
                 self._moves += moves
-        waits = held or self._reason_to_wait()
+        wait_reason = hold_reason or self._reason_to_wait()
         if self._steps:
-            self._check_progress(waits, tick)
+            self._check_progress(wait_reason, tick)
         for arm in self._table.arms:
-            self._order(arm, held, self.ports[f"order_{arm}"])
+            self._order(arm, hold_reason, self.ports[f"order_{arm}"])
         self._agreement.write_to(self.progress)
         fill_counts(self.progress.record[["moves"]], (self._moves,))
-        self._report(waits, self.status)
+        self._report(wait_reason, self.status)
 
     def _moves_of_step(self) -> tuple[int, int]:
-        """Return how many moves of the present step are done, of how many."""
+        """Return how many moves of the present step are done, and how many it has."""
         agreement = self._agreement
         reports = [self._readings[arm].message for arm in agreement.partners]
-        mine = [r for r in reports if (r.program, r.echo) == (agreement.program, agreement.order)]
-        return sum(r.moves_done for r in mine), sum(r.moves for r in mine)
+        present = agreement.program, agreement.order
+        own_reports = [report for report in reports if (report.program, report.echo) == present]
+        return sum(report.moves_done for report in own_reports), sum(
+            report.moves for report in own_reports
+        )
 
     def _reason_to_hold(self) -> str:
-        """Return why the arms are to rest on their paths; empty: they are not."""
+        """Return why the arms must rest on their paths, or an empty string."""
         if self._operated.holds:
             return self._operated.keeps(self.context.board)
         if self._agreement.phase in (Phase.ENDING, Phase.OVER):
@@ -241,7 +258,7 @@ class Coordinator(Executor):
         return ""
 
     def _reason_to_wait(self) -> str:
-        """Return why the program does not go on; empty: it does."""
+        """Return why the program does not advance, or an empty string."""
         agreement = self._agreement
         if agreement.phase is Phase.ENDING:
             return agreement.reason
@@ -255,9 +272,10 @@ class Coordinator(Executor):
                 return f"{arm}: {report.reason}"
         return ""
 
-    def _check_progress(self, waits: str, tick: int) -> None:
-        """End the program when nothing has happened for too long, unless an operator keeps it from
-        going on.
+    def _check_progress(self, wait_reason: str, tick: int) -> None:
+        """End the program if nothing has happened for too long.
+
+        Time during which an operator holds a level does not count.
         """
         agreement = self._agreement
         reports = [reading.message for reading in self._readings.values()]
@@ -265,32 +283,36 @@ class Coordinator(Executor):
         stage = (
             agreement.phase,
             agreement.order,
-            *((r.echo, r.response, r.moves_done, r.moves) for r in reports),
+            *(
+                (report.echo, report.response, report.moves_done, report.moves)
+                for report in reports
+            ),
         )
         if operated or stage != self._stage:
             self._stage = stage
             self._moved_at = tick
         elif (tick - self._moved_at) * self.context.tick_s > self._table.stalled_s:
-            awaited = waits or f"step {agreement.step}: {', '.join(agreement.partners)}"
+            awaited = wait_reason or f"step {agreement.step}: {', '.join(agreement.partners)}"
             reason = f"nothing has happened for {self._table.stalled_s:g} s: {awaited}"
             agreement.end(Error.STALLED, reason)
 
-    def _order(self, arm: str, held: str, order: CellOrder) -> None:
-        """Fill the order for one arm."""
+    def _order(self, arm: str, hold_reason: str, order: CellOrder) -> None:
+        """Write the order for one arm."""
         agreement = self._agreement
-        what = agreement.verb(arm)
-        if what in (OrderVerb.ASK, OrderVerb.DO, OrderVerb.CANCEL):
+        verb = agreement.verb(arm)
+        if verb in (OrderVerb.ASK, OrderVerb.DO, OrderVerb.CANCEL):
             write_action(self._steps[agreement.step][arm], order)
             if order.by:
                 order.by += agreement.begun
-        is_spoken_to = what is not OrderVerb.NONE
-        order.id = agreement.order if is_spoken_to else 0
-        order.program = agreement.program if is_spoken_to else 0
-        order.what = what
-        order.hold = bool(held)
-        order.reason = agreement.reason if what is OrderVerb.END else held
+        has_order = verb is not OrderVerb.NONE
+        order.id = agreement.order if has_order else 0
+        order.program = agreement.program if has_order else 0
+        order.what = verb
+        order.hold = bool(hold_reason)
+        order.reason = agreement.reason if verb is OrderVerb.END else hold_reason
 
-    def _report(self, waits: str, status: TaskStatus) -> None:
+    def _report(self, wait_reason: str, status: TaskStatus) -> None:
+        """Write the status of this level."""
         agreement = self._agreement
         status.state = State.IDLE
         status.error = Error.NONE
@@ -300,8 +322,8 @@ class Coordinator(Executor):
             status.error = agreement.error
             status.reason = agreement.reason
         elif self._steps:
-            status.state = State.HOLDING if waits else State.EXECUTING
-            status.reason = waits
+            status.state = State.HOLDING if wait_reason else State.EXECUTING
+            status.reason = wait_reason
         status.action = agreement.step
         status.actions = len(self._steps)
         done, moves = self._moves_of_step()

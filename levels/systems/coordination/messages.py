@@ -1,7 +1,8 @@
-"""Orders for a task level from another rack, and its reports: one mailbox each way for every arm.
+"""Orders to a task level from another rack, and its reports: one mailbox each way for every arm.
 
-Both racks must have the same layout of them, whatever their arms: no symbolic sizes. Each message
-says all there is to know, so that those that are lost, or overtaken by a newer one, are not missed.
+Both racks must have the same message layout whatever their arms are, so there are no symbolic
+sizes. Each message contains the complete state, so that messages may be lost or overtaken by newer
+ones.
 """
 
 from __future__ import annotations
@@ -18,21 +19,21 @@ from rack.levels.operator import MAX_JOINTS, Goal
 
 MailboxName = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]*\.[a-z][a-z0-9_]*$")]
 OBJECT_BYTES = 32
-"""Longest name of an object that an order can give."""
+"""Longest name of an object in an order."""
 
 
 class OrderVerb(IntEnum):
-    """What is said of an order."""
+    """Request of an order."""
 
     NONE = 0
-    ASK = 1  # rehearse the action, and answer whether it can be done by its time
-    DO = 2  # carry out what was answered to be possible
-    CANCEL = 3  # forget it, or come to rest where it can be broken off
-    END = 4  # the program is over: come to rest, end the run
+    ASK = 1  # rehearse the action and answer whether it can be done in time
+    DO = 2  # carry out the action that was answered to be possible
+    CANCEL = 3  # forget the action, or come to rest where it can be interrupted
+    END = 4  # the program is over: come to rest and end the run
 
 
 class OrderAction(IntEnum):
-    """What an order is about, as in `[[task.action]]`."""
+    """Action of an order, as in `[[task.action]]`."""
 
     NONE = 0
     TRANSFER = 1
@@ -41,32 +42,32 @@ class OrderAction(IntEnum):
 
 
 class Response(IntEnum):
-    """An arm's answer to the order that its report echoes."""
+    """Answer of an arm to the order that its report echoes."""
 
-    NONE = 0  # not yet
-    POSSIBLE = 1  # kept until DO, CANCEL or another order
+    NONE = 0  # no answer yet
+    POSSIBLE = 1  # valid until DO, CANCEL or another order
     REFUSED = 2
     DOING = 3
     DONE = 4
     FAILED = 5
-    CANCELLED = 6  # before it began
-    STOPPED = 7  # after it had begun, by CANCEL or another order
-    ENDED = 8  # the arm rests, and its task level ends
+    CANCELLED = 6  # cancelled before it began
+    STOPPED = 7  # stopped by CANCEL or another order after it had begun
+    ENDED = 8  # the arm rests and its task level ends
 
 
 class Phase(IntEnum):
-    """What a coordinator is about."""
+    """Activity of a coordinator."""
 
-    AWAITING = 0  # the arms' reports, before the first step or after a new launch
+    AWAITING = 0  # waits for reports before the first step or after a new launch
     ASKING = 1
     DOING = 2
-    CANCELLING = 3  # the answers, to ask anew
+    CANCELLING = 3  # waits until all have cancelled, to ask again
     ENDING = 4
     OVER = 5
 
 
 class CellAction(Message):
-    """An action, as in `[[task.action]]`; `by` is the time of the rack that wrote the message."""
+    """An action as in `[[task.action]]`. `by` is in the time of the rack that wrote the message."""
 
     action: OrderAction = field(doc="what to do")
     object: str = field(f"S{OBJECT_BYTES}", doc="object of a transfer")
@@ -74,81 +75,88 @@ class CellAction(Message):
     position: ndarray = field(
         unit="m", doc="where a transfer takes the object's origin, or a goto the tool", shape=3
     )
-    turned: bool = field(doc="1: a transfer turns the object to `yaw`; 0: any turn")
+    turned: bool = field(doc="whether a transfer turns the object to `yaw`")
     yaw: float = field(unit="rad", doc="turn of the object's x axis about the vertical")
     lift: float = field(unit="m", doc="height of a transfer's straight motions")
-    quaternion: ndarray = field(unit="1", doc="of the tool, for goal pose", shape=4)
-    direction: ndarray = field(unit="1", doc="of the tool's z axis, for goal direction", shape=3)
-    count: int = integer("joints that follow", "u1")
+    quaternion: ndarray = field(unit="1", doc="orientation of the tool, for goal pose", shape=4)
+    direction: ndarray = field(
+        unit="1", doc="direction of the tool's z axis, for goal direction", shape=3
+    )
+    count: int = integer("number of values in `joints`", "u1")
     joints: ndarray = field(unit="rad", doc="joint positions, for goal joints", shape=MAX_JOINTS)
-    by: float = field(unit="s", doc="simulated time by which it must be done; 0: any time")
+    by: float = field(unit="s", doc="simulated time by which it must be done, 0 for any time")
 
 
 class OrderHead(Command):
-    """What is said of an order, without its action."""
+    """Head of an order, without its action."""
 
-    program: int = integer("checksum of the program that the order is of")
-    what: OrderVerb = field(doc="ask, do, cancel: all of the order `id`; end")
-    hold: bool = field(doc="1: the arm rests on its path while it does an order")
-    reason: str = field(doc="with `hold` why; with END why the program failed, empty: it is done")
+    program: int = integer("checksum of the program to which the order belongs")
+    what: OrderVerb = field(doc="what to do with the order `id`, or the end of the program")
+    hold: bool = field(doc="whether the arm must rest on its path while it carries out an order")
+    reason: str = field(
+        doc="reason for `hold`, or with END why the program failed, empty after success"
+    )
 
 
 class CellOrder(OrderHead, CellAction, version=1):
-    """From a coordinator to the task level of another rack."""
+    """Order from a coordinator to the task level of another rack."""
 
 
 class CellReport(Status, version=1):
-    """From a task level to the rack that orders its actions."""
+    """Report of a task level to the rack that orders its actions."""
 
-    error: Error = field("u2", doc="error code of the level; 0: none")
-    program: int = integer("as in the order that is echoed")
+    error: Error = field("u2", doc="error code of the level, 0 if there is none")
+    program: int = integer("checksum of the program of the echoed order")
     response: Response = field(
-        doc="the answer to it; `reason`: of a refusal or failure, else of waiting"
+        doc="answer to the echoed order; `reason` says why it is refused, has failed or waits"
     )
     earliest: float = field(
-        unit="s", doc="earliest end, simulated time of the rack that gave the order; 0: not known"
+        unit="s",
+        doc="earliest end, simulated time of the rack that gave the order, 0 if it is not known",
     )
     until: float = field(
         unit="s",
-        doc="in that time, when DO must be read for an answer POSSIBLE to hold; 0: any time",
+        doc="latest time, on the same clock, to read DO after POSSIBLE, 0 for any time",
     )
     moves_done: int = integer("elemental moves of the order done", "u2")
     moves: int = integer("elemental moves of the order; 0 before it begins", "u2")
     halted: bool = field(
-        doc="1: moves were withdrawn, the arm is held until it begins another order"
+        doc="whether moves were withdrawn, so that the arm is held until it begins another order"
     )
     operated: bool = OPERATED
 
 
 class RequestHead(Message):
-    """For what a plan is wanted, without the action."""
+    """Head of a request for a plan, without its action."""
 
-    id: int = integer("serial of the plan wanted; 0: none yet")
-    program: int = integer("as in the order that it serves")
-    order: int = integer("that order")
+    id: int = integer("serial of the plan wanted, 0 if there is none")
+    program: int = integer("checksum of the program of the order")
+    order: int = integer("id of the order")
     begin: float = field(
-        unit="s", doc="simulated time at which it must be possible to begin; 0: at once"
+        unit="s", doc="simulated time at which it must be possible to begin, 0 for at once"
     )
     ahead: float = field(
         unit="s",
-        doc=("simulated time of the rack that gave the order, in which `by` is, less that here"),
+        doc="time of the rack that gave the order, to which `by` refers, minus the time here",
     )
-    revision: int = integer("of the world model then")
-    start: ndarray = per_joint("rad", "where the arm rested then")
+    revision: int = integer("revision of the world model at the request")
+    start: ndarray = per_joint("rad", "where the arm rested at the request")
 
 
 class CellRequest(RequestHead, CellAction, version=1):
-    """From an ordered task level's executor to its planner."""
+    """Request for a plan from an ordered task level's executor to its planner."""
 
 
 class CellProgress(Message, version=2):
-    """A coordinator's memory, from which it continues after a restart of its board."""
+    """State of a coordinator, from which it continues after a restart of its board."""
 
-    phase: Phase = field(doc="of the present step")
+    phase: Phase = field(doc="activity in the present step")
     step: int = integer("steps done", "u2")
-    attempt: int = integer("times that the present step was asked for before", "u2")
-    error: Error = field("u2", doc="why the program ends early; 0: it does not")
-    reason: str = field(doc="the error, readable")
-    ending: float = field(unit="s", doc="simulated time since when the arms are ended; 0: not yet")
-    begun: float = field(unit="s", doc="simulated time from which `by` counts; 0: not yet")
+    attempt: int = integer("number of earlier attempts at the present step", "u2")
+    error: Error = field("u2", doc="why the program ends early, 0 if it does not")
+    reason: str = field(doc="the error as text")
+    ending: float = field(
+        unit="s", doc="simulated time since when the arms are being ended, 0 before that"
+    )
+    begun: float = field(unit="s", doc="simulated time from which `by` counts, 0 before that")
     moves: int = integer("elemental moves of the steps done", "u2")

@@ -1,6 +1,6 @@
-"""An ordered task level: takes its actions from a coordinator, one order at a time.
+"""Task level that takes its actions from a coordinator, one order at a time.
 
-Its planner makes elemental moves of an order, or finds the reason why it cannot be done.
+Its planner plans the elemental moves of an order, or finds the reason why it cannot be done.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ from rack.levels.task.rehearsal import Rehearsed, finish_times
 
 RackName = Annotated[str, StringConstraints(pattern=f"^({RACK_NAME})?$")]
 PLANNED = (Response.POSSIBLE, Response.DOING, Response.REFUSED)
-"""Answers to an order that rest on its plan."""
+"""Responses to an order that are based on its plan."""
 MAX_STRAY_RAD = 0.005
-"""A plan holds if no joint has moved farther since it was requested."""
+"""Largest motion of a joint since the request of a plan with which the plan is still valid."""
 
 
 class OrderedTaskParams(TaskParams):
-    """From where a task level takes its orders, and for how long it keeps a promise."""
+    """Source of the orders of a task level, and how long it keeps a promise."""
 
     coordinator: RackName = ""
     """rack that gives the orders over the network; empty: a board of this rack gives them"""
@@ -51,16 +51,16 @@ class OrderedTaskParams(TaskParams):
 
 
 class OrderedTaskExecutor(TaskExecutor):
-    """Answers what it is asked, and does what it has answered to be possible.
+    """Answers the orders of a coordinator and carries out the ones that it has accepted.
 
-    While its orders are lost it holds the arm on its path. It ends its run when the coordinator
-    says so, or when that stays away for `stalled_s`.
+    While its orders are lost, it holds the arm on its path. It ends its run on command of the
+    coordinator, or if the coordinator is away for `stalled_s`.
     """
 
     world = Input(WorldState, "world.model")
     last_request = Input(CellRequest, "own.request")
     last_report = Input(CellReport, "own.report")
-    # The report last: what it says has begun is in the status.
+    # The report is written last, so that an order that it shows as begun is in the status.
     request = Output(CellRequest)
     report = Output(CellReport)
     params = OrderedTaskParams
@@ -72,22 +72,29 @@ class OrderedTaskExecutor(TaskExecutor):
         rack = self._table.coordinator
         self._source = f"rack '{rack}'" if rack else "the coordinator"
         self._taken = TakenOrder()
-        self._begun = 0  # request whose plan is followed; 0: none
+        # Id of the request whose plan is followed. 0 if none is.
+        self._begun = 0
         self._orders_begun = 0
         self._orders_done = 0
-        self._moves = 0, 0  # done, of how many, of the newest order begun
-        self._halted = False  # moves were withdrawn: the arm is held until another order begins
-        self._breaking_off: int | None = None  # first move that must not begin
-        self._rests = False  # the arm is held so that the order can be broken off
-        self._absent = ""  # why there are no orders
-        self._held = ""  # why the coordinator holds the arm
-        self._waits = ""  # why an order cannot be planned yet
+        # Moves done, and number of moves, of the newest order that has begun.
+        self._moves = 0, 0
+        # Whether moves were withdrawn, so that the arm is held until another order begins.
+        self._halted = False
+        # First move that must not begin because the order is being interrupted.
+        self._breaking_off: int | None = None
+        # Whether the arm is held so that the order can be interrupted.
+        self._rests = False
+        # Why there are no orders, why the coordinator holds the arm, and why planning waits.
+        self._absent = ""
+        self._held = ""
+        self._waits = ""
         self._is_end_reported = False
-        self._nothing = TaskPlan.zeros(context.sizes)  # the plan of no order
+        # Plan that is followed without an order.
+        self._nothing = TaskPlan.zeros(context.sizes)
 
     @classmethod
     def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, type[Message]]) -> MadePorts:
-        """Return the mailboxes of the orders and, over the network, of the other rack's time."""
+        """Return the port for orders and, over a network, the one for the other rack's clock."""
         try:
             table = OrderedTaskParams.model_validate(params)
         except ValidationError:
@@ -98,9 +105,11 @@ class OrderedTaskExecutor(TaskExecutor):
         return MadePorts(ports)
 
     def _first_actions(self) -> tuple[AnyAction, ...]:
+        """Return no actions, because all of them come as orders."""
         return ()
 
     def _recall(self) -> None:
+        """Continue from the last status, report and request after a restart of the board."""
         super()._recall()
         last = self.last_status.message
         self._orders_begun = last.actions
@@ -119,7 +128,7 @@ class OrderedTaskExecutor(TaskExecutor):
             self._take_action(self.request)
 
     def _plan_to_follow(self, tick: int) -> TaskPlan:
-        """Follow the orders; return the plan of the one under way."""
+        """Process the orders and return the plan of the one that is being carried out."""
         self._listen(self.ports["order"])
         self._waits = ""
         taken = self._taken
@@ -130,7 +139,7 @@ class OrderedTaskExecutor(TaskExecutor):
         elif taken.is_under_way and not self._begun:
             self._begin(request)
         self.status.echo = plan.id if plan.id == request.id else 0
-        # Report the earliest end, and how long a promise holds, in the coordinator's time.
+        # Report the earliest end, and how long the promise is valid, in the coordinator's time.
         report = self.report
         response = self._taken.response
         report.earliest = 0.0
@@ -144,7 +153,7 @@ class OrderedTaskExecutor(TaskExecutor):
         return plan if self._begun and self._begun == plan.id else self._nothing
 
     def _listen(self, reading: Reading[CellOrder]) -> None:
-        """Take up what the coordinator says, or note why it says nothing."""
+        """Process the newest order, or note why there is none."""
         order = reading.message
         self._held = self._absent = ""
         if not reading.is_there:
@@ -162,7 +171,7 @@ class OrderedTaskExecutor(TaskExecutor):
             self._absent = ""
 
     def _answer_order(self, request: CellRequest, tick: int) -> None:
-        """Answer when the order is planned; have it planned as soon as the arm rests."""
+        """Answer an order once it is planned. Request its plan as soon as the arm rests."""
         plan = self.plan.message
         taken = self._taken
         if (request.program, request.order) == (taken.program, taken.order):
@@ -175,7 +184,7 @@ class OrderedTaskExecutor(TaskExecutor):
         if self._waits:
             return
         order: CellOrder = self.ports["order"].message
-        # The coordinator's simulated time less that here.
+        # The coordinator's simulated time minus the one of this rack.
         ahead_s = float(self.ports["peer"].message.ahead) if self._table.coordinator else 0.0
         now_s = tick * self.context.tick_s
         try:
@@ -195,14 +204,14 @@ class OrderedTaskExecutor(TaskExecutor):
         self._request(request, now_s + planned_s + self._table.decision)
 
     def _request(self, request: CellRequest, begin_s: float) -> None:
-        """Have the action in `request` planned, to begin at `begin_s`."""
+        """Request a plan for the action in `request` that can begin at simulated time `begin_s`."""
         request.id += 1
         request.begin = begin_s
         request.revision = self.world.message.revision
         request.start = self.below.message.start
 
     def _not_ready(self) -> str:
-        """Return why nothing can be planned now; empty: it can."""
+        """Return why nothing can be planned at present, or an empty string."""
         if self._orders.stands or not self.below.message.resting:
             return "the arm does not rest yet"
         if not self.world.message.revision:
@@ -214,13 +223,11 @@ class OrderedTaskExecutor(TaskExecutor):
         return ""
 
     def _begin(self, request: CellRequest) -> None:
-        """Begin with the plan that was promised; have it planned anew if the world has changed
-        since.
-        """
+        """Begin the promised plan, or request another one if the world has changed since."""
         if not self._actions:
             self._take_action(request)
-        strays = float(np.abs(self.below.message.start - request.start).max()) > MAX_STRAY_RAD
-        if request.begin and (strays or self.world.message.revision != request.revision):
+        has_strayed = float(np.abs(self.below.message.start - request.start).max()) > MAX_STRAY_RAD
+        if request.begin and (has_strayed or self.world.message.revision != request.revision):
             self._waits = self._not_ready()
             if not self._waits:
                 self._request(request, 0.0)
@@ -232,46 +239,52 @@ class OrderedTaskExecutor(TaskExecutor):
             self._orders_begun += 1
 
     def _take_action(self, request: CellRequest) -> None:
+        """Take the action and the time offset of a request."""
         self._actions = (read_action(request, self.context),)
         self._ahead_s = request.ahead
 
     def _step_aside(self, plan: TaskPlan, below: MoveStatus) -> int:
-        """Interrupt the order for an operator, or break it off."""
+        """Interrupt the order, for an operator or because it was stopped."""
         done = super()._step_aside(plan, below)
         self._halted = self._halted and not self._detour.move
         self._breaking_off = None
-        rested = self._rests
+        has_rested = self._rests
         self._rests = False
         if self._taken.stops and self._detour.move:
             self._taken.answer(Response.STOPPED)
         elif self._taken.stops:
             self._breaking_off, self._rests = self._window.breaking_off(plan, done, below)
-            if rested and below.resting:
+            if has_rested and below.resting:
                 self._taken.answer(Response.STOPPED)
                 self._halted = True
         return done
 
     def _shown_until(self, plan: TaskPlan) -> int:
+        """Return the first move that must not be shown to the level below."""
         until = super()._shown_until(plan)
         return until if self._breaking_off is None else min(until, self._breaking_off)
 
     def _reason_to_wait(self, below: Reading[MoveStatus]) -> str:
+        """Return why the arm waits: for an operator, for orders or for a plan."""
         waits = super()._reason_to_wait(below)
         if self._orders.stands:
             return waits
         return self._absent or self._held or waits or self._waits
 
     def _check_progress(self, plan: TaskPlan, waits: str, tick: int) -> None:
-        # While the coordinator holds the arm, it also says for how long.
+        # While the coordinator holds the arm, it decides for how long.
+        """End with an error if nothing has happened for too long."""
         if self._held:
             self._moved_at = tick
         else:
             super()._check_progress(plan, waits, tick)
 
     def _stage(self) -> tuple[int, ...]:
+        """Return a tuple that changes whenever the orders make progress."""
         return self._taken.order, self._taken.response, self._begun, not self._absent
 
     def _report(self, plan: TaskPlan, waits: str) -> None:
+        """Write status and report, after ending an order that is done or has failed."""
         report = self.report
         status = self.status
         echo = self.status.echo
@@ -300,11 +313,14 @@ class OrderedTaskExecutor(TaskExecutor):
         self._is_end_reported = taken.response is Response.ENDED
 
     def _about(self, action: int, why: str) -> str:
-        """Return a reason without the number: an order is one action."""
+        """Return a reason without the number of the action, because an order is one action."""
         return why.lstrip(",: ")
 
     def _settle(self, plan: TaskPlan) -> None:
-        """End the order that is done or has failed; what ends the run as well stays an error."""
+        """End an order that is done or has failed.
+
+        An error that ends the whole run is kept. Any other error becomes the answer to the order.
+        """
         taken = self._taken
         if self._error and (taken.is_asked or taken.is_under_way):
             if self._absent and self._error is Error.STALLED:
@@ -318,12 +334,14 @@ class OrderedTaskExecutor(TaskExecutor):
             self._orders_done += 1
 
     def _answer(self, below: MoveStatus) -> None:
+        """Write the command to the level below, with a hold if the arm must rest."""
         super()._answer(below)
         is_held = self._taken.is_under_way and (self._absent or self._held)
         if not self._detour.move and (self._halted or self._rests or is_held):
             self.command.hold = True
 
     def _state(self, plan: TaskPlan) -> State:
+        """Return the state that the status shows."""
         if self._error:
             return State.ERROR
         if self._taken.response is Response.ENDED:
@@ -333,7 +351,7 @@ class OrderedTaskExecutor(TaskExecutor):
 
 
 class OrderedTaskPlanner(TaskPlanner):
-    """Plans what its executor requests: the action of an order, to begin later or at once."""
+    """Plans the action of an order as its executor requests: to begin later or at once."""
 
     request = Input(CellRequest, "own.request")
     params = OrderedTaskParams
@@ -342,16 +360,18 @@ class OrderedTaskPlanner(TaskPlanner):
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         self._id = 0
-        self._begin_s = 0.0  # simulated time at which the plan may have to begin
+        # Simulated time before which the plan will not begin.
+        self._begin_s = 0.0
 
     def _first_program(self) -> TaskConfig:
+        """Return an empty program, because actions come as requests."""
         return TaskConfig()
 
     def wanted(self, tick: int) -> bool:
-        """Return whether a request is not answered yet, and the world is known and at rest."""
+        """Return True if a request is unanswered, and the world is known and at rest."""
         request = self.request.message
         if request.id not in (0, self._id):
-            # Whoever requests it has found that it suits the arm.
+            # The executor has checked that the action suits the arm before it sent the request.
             action = read_action(request, self.context)
             self._program = TaskConfig(action=(action,))
             self._id = request.id
@@ -361,13 +381,15 @@ class OrderedTaskPlanner(TaskPlanner):
         return super().wanted(tick)
 
     def _reason(self, refused: Refused) -> str:
-        """Return why the order is refused; it is one action, without a number."""
+        """Return why an order is refused, without the number of the action."""
         return str(refused)
 
     def _visible_s(self, tick: int) -> float:
+        """Return the earliest simulated time at which the plan can begin, s."""
         return max(super()._visible_s(tick), self._begin_s + self.context.period_s)
 
     def _promise(self, moves: Sequence[Rehearsed], visible_s: float) -> None:
+        """Add the earliest end of the order to the plan, in the coordinator's time."""
         super()._promise(moves, visible_s)
         unhurried = [Rehearsed(move._replace(by_s=0.0), duration_s) for move, duration_s in moves]
         self.output.earliest = (

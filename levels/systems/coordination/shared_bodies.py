@@ -1,17 +1,17 @@
-"""Bodies that several racks simulate: each rack has a copy of its own, and one of them at a time
-moves the body.
+"""Bodies that several racks simulate. Each rack has a copy, and one rack at a time moves the body.
 
-All that passes between the simulations is a mailbox, `servo.shared`, up to 50 times a second. A
-body belongs to the rack whose gripper has begun to touch it last: that rack's simulation moves it,
-and the copies of the others stay where it reports the body to be. To begin to touch is to claim,
-with the next number. Of two claims the one with the greater number stands, of two equal ones that
-of the rack whose name comes last: all racks that have read the same messages agree. A body that
-nobody has touched yet moves in every simulation by itself.
+The simulations exchange only a mailbox, `servo.shared`, up to 50 times a second. A body belongs to
+the rack whose gripper was the last to touch it. The simulation of that rack moves the body, and the
+copies in the other racks stay at the pose that it reports. The first touch claims the body with the
+next number. Of two claims the one with the greater number wins. If the numbers are equal, the rack
+whose name is greater wins, so racks that have read the same messages agree. Until somebody touches
+a body, every simulation moves its own copy.
 
-Modelled: one body in one place, carried by one arm after the other. Not modelled: forces between
-arms of two racks, on each other or through a body that both touch; the program keeps the arms
-apart. A copy is as late as the messages, and where none come any more it stays where it is. A rack
-that is launched anew takes over what the others know, its own claims of before included.
+The model covers one body in one place that arms carry one after the other. It does not cover forces
+between the arms of two racks, directly or through a body that both touch; the program must keep the
+arms apart. A copy is as late as the messages are, and stays where it is when none arrive any more.
+A rack that is launched again takes over the claims that the others know, including the ones of its
+earlier launch.
 """
 
 from __future__ import annotations
@@ -25,27 +25,27 @@ from rack.backplane.message import Message, field, integer
 from rack.levels.algebra import Array
 
 MOST_SHARED = 4
-"""Bodies that one rack shares, at most: the message has the same layout in every rack."""
+"""Maximum number of bodies that a rack shares. The message has the same layout in every rack."""
 NAME_BYTES = 40
 MOST_CLAIMS = (1 << 32) - 1
 FARTHEST_M = 1e3
-"""From the origin: the simulation gives up bodies that are farther away than it can count."""
+"""Largest valid distance from the origin. The simulation gives up bodies much farther away."""
 
 
 class SharedBodyEntry(Message, version=1, message="shared_body"):
     """One body that several racks share."""
 
-    name: str = field(f"S{NAME_BYTES}", doc="body, by its name in the model; empty: none")
-    claim: int = integer("number of the claim that stands, as far as this rack knows; 0: none yet")
+    name: str = field(f"S{NAME_BYTES}", doc="name of the body in the model, empty if there is none")
+    claim: int = integer("number of the claim that this rack knows to be valid, 0 if there is none")
     owner: str = field(
-        f"S{NAME_BYTES}", doc="rack whose claim that is: its simulation moves the body"
+        f"S{NAME_BYTES}", doc="rack that made the claim, whose simulation moves the body"
     )
-    touched: bool = field(doc="1: the gripper of this rack touches it")
+    touched: bool = field(doc="whether the gripper of this rack touches it")
     position: np.ndarray = field(
         unit="m", doc="body origin in this rack's simulation", shape=3, length=(0.0, FARTHEST_M)
     )
     quaternion: np.ndarray = field(
-        unit="1", doc="body orientation, likewise", shape=4, length=(0.999, 1.001)
+        unit="1", doc="body orientation in this rack's simulation", shape=4, length=(0.999, 1.001)
     )
 
 
@@ -57,7 +57,7 @@ class SharedBodies(Message, version=1):
 
 
 class Claim(NamedTuple):
-    """The claim to a body that stands: of two, the greater one."""
+    """Claim to a body: a number and the rack that made it. The greater of two claims wins."""
 
     number: int = 0
     owner: bytes = b""
@@ -68,7 +68,14 @@ UNCLAIMED = Claim()
 
 @dataclass
 class SharedBody:
-    """What one rack, `rack`, knows of a body that it shares."""
+    """State of one shared body in one rack.
+
+    Attributes:
+        name: Name of the body.
+        rack: Name of this rack.
+        claim: The claim that is valid as far as this rack knows.
+        is_touched: Whether the gripper of this rack touches the body.
+    """
 
     name: bytes
     rack: bytes
@@ -77,38 +84,40 @@ class SharedBody:
 
     @property
     def is_elsewhere(self) -> bool:
-        """Whether the simulation of another rack moves it."""
+        """Whether the simulation of another rack moves the body."""
         return self.claim.owner not in (b"", self.rack)
 
     def touch(self, touches: bool) -> None:
-        """Claim the body if this rack's gripper begins to touch it."""
+        """Note whether this rack's gripper touches the body. The first touch claims the body."""
         if touches and not self.is_touched and self.claim.owner != self.rack:
             self.claim = Claim(min(self.claim.number + 1, MOST_CLAIMS), self.rack)
         self.is_touched = touches
 
     def hear(self, message: SharedBodies) -> Array | None:
-        """Take what another rack says; return where the body is, (7,), m and quaternion; None:
-        nothing new.
+        """Process a message of another rack.
 
-        What counts is a greater claim, whoever reports it, and after that the word of the owner.
+        A greater claim is accepted from any rack. Otherwise only the owner's message counts.
+
+        Returns:
+            The new pose of the body, (7,), m and quaternion. None if the message has nothing new.
         """
-        for told in message.bodies[message.bodies["name"] == self.name]:
-            claim = Claim(int(told["claim"]), bytes(told["owner"]))
+        for entry in message.bodies[message.bodies["name"] == self.name]:
+            claim = Claim(int(entry["claim"]), bytes(entry["owner"]))
             if claim > self.claim or (
                 claim == self.claim and self.is_elsewhere and message.record["rack"] == claim.owner
             ):
                 self.claim = claim
-                return np.concatenate((told["position"], told["quaternion"]))
+                return np.concatenate((entry["position"], entry["quaternion"]))
         return None
 
     def recall(self, message: SharedBodies) -> None:
-        """Take over what this rack itself said last, after a restart of the board."""
-        for told in message.bodies[message.bodies["name"] == self.name]:
-            self.claim = Claim(int(told["claim"]), bytes(told["owner"]))
-            self.is_touched = bool(told["touched"])
+        """Restore the state from this rack's own last message, after a restart of the board."""
+        for entry in message.bodies[message.bodies["name"] == self.name]:
+            self.claim = Claim(int(entry["claim"]), bytes(entry["owner"]))
+            self.is_touched = bool(entry["touched"])
 
     def show(self, record: np.void, pose: Array) -> None:
-        """Fill a `SharedBodyEntry`; `pose` (7,) is that of the own simulation."""
+        """Write the state into a `SharedBodyEntry`. `pose` is (7,), from this rack's simulation."""
         record["name"] = self.name
         record["touched"] = self.is_touched
         record["claim"] = self.claim.number

@@ -1,5 +1,6 @@
-"""The simulated arm in a cell whose bodies other simulations may move: see
-`rack.levels.systems.coordination.shared_bodies`.
+"""Simulated arm in a scene with bodies that other simulations may move.
+
+See `rack.levels.systems.coordination.shared_bodies`.
 """
 
 from __future__ import annotations
@@ -13,51 +14,54 @@ from rack.levels.tables import SceneConfig
 
 POSE = 7
 MOTION = 6
-"""Numbers of a free body in qpos and qvel."""
+"""Numbers of values of a free body in qpos (`POSE`) and in qvel (`MOTION`)."""
 
 
 class SharingArm(SimulatedArm):
-    """Keeps copies of objects where it is told, between MuJoCo's ticks; within one they are bodies
-    like others.
+    """Simulated arm that can fix copies of objects at given poses.
 
-    Rows are those of the world model.
+    The copies are moved between the ticks of MuJoCo. Within a tick they behave like other bodies.
+    Rows are rows of the world model.
     """
 
-    sleeps = False  # an object that is put elsewhere would not wake
+    # A sleeping object would not wake when it is moved from outside.
+    sleeps = False
 
     def __init__(
         self, cell: Cell, scene: SceneConfig, clock_ns: int, every: int = 1, seed: int = 0
     ) -> None:
         super().__init__(cell, scene, clock_ns, every, seed)
-        self._kept: dict[int, Array] = {}  # row of a copy: where it stays, (7,)
+        # Pose of each fixed copy by row, (7,), m and quaternion.
+        self._kept: dict[int, Array] = {}
 
     def is_touched(self, row: int) -> bool:
-        """Return whether the gripper touches an object."""
+        """Return True if the gripper touches an object."""
         return bool(self._held()[self.cell.parts(row)].any())
 
     def pose(self, row: int) -> Array:
-        """Return the pose of an object, (7,), m and quaternion, as simulated."""
-        at = self.cell.object_qpos[row]
-        return np.array(self._data.qpos[at : at + POSE])
+        """Return the simulated pose of an object, (7,), m and quaternion."""
+        qpos_index = self.cell.object_qpos[row]
+        return np.array(self._data.qpos[qpos_index : qpos_index + POSE])
 
     def place(self, row: int, pose: Array) -> None:
-        """Put an object to a pose, (7,), at rest."""
+        """Move an object to a pose, (7,), m and quaternion, and set its velocity to zero."""
         model = self._model
-        at = self.cell.object_qpos[row]
-        dof = model.body_dofadr[self.cell.bodies[row]]
-        self._data.qpos[at : at + POSE] = pose
-        self._data.qvel[dof : dof + MOTION] = 0.0
+        qpos_index = self.cell.object_qpos[row]
+        dof_index = model.body_dofadr[self.cell.bodies[row]]
+        self._data.qpos[qpos_index : qpos_index + POSE] = pose
+        self._data.qvel[dof_index : dof_index + MOTION] = 0.0
         if row in self._kept:
             self._kept[row] = pose
 
     def keep(self, row: int, kept: bool) -> None:
-        """Keep an object where it is from now on, or let the simulation move it."""
+        """Fix an object at its present pose, or let the simulation move it again."""
         if not kept:
             self._kept.pop(row, None)
         elif row not in self._kept:
             self._kept[row] = self.pose(row)
 
     def _simulate(self) -> None:
+        """Simulate a tick, then return the fixed copies to their poses."""
         super()._simulate()
         for row, pose in self._kept.items():
             self.place(row, pose)

@@ -1,4 +1,4 @@
-"""The servo level of an arm that shares objects with the arms of other racks."""
+"""Servo level of an arm that shares objects with the arms of other racks."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from rack.levels.systems.coordination.shared_bodies import (
 from rack.levels.systems.coordination.sharing_arm import SharingArm
 
 SHARED = Output(SharedBodies, cycles=8)
-"""At 400 Hz 50 Hz: the fastest exchange between racks."""
+"""Exchanged at 50 Hz if the clock runs at 400 Hz, the fastest exchange between racks."""
 
 
 class SharingServoParams(ServoParams):
@@ -33,19 +33,19 @@ class SharingServoParams(ServoParams):
     @field_validator("arm")
     @classmethod
     def _shares(cls, reference: str) -> str:
+        """Check that the arm can share objects."""
         if not issubclass(find_arm(reference), SharingArm):
             raise ValueError(
-                "the arm shares no objects; permitted:"
-                " rack.levels.systems.coordination.sharing_arm:SharingArm and subclasses"
+                "this arm cannot share objects; it must be"
+                " rack.levels.systems.coordination.sharing_arm:SharingArm or a subclass"
             )
         return reference
 
 
 class SharingServoExecutor(ServoExecutor):
-    """Claims the shared objects that its gripper touches, and places those that other arms have:
-    see `SharedBody`.
+    """Servo level that claims the shared objects its gripper touches, and fixes the others' copies.
 
-    After a restart of its board it continues from its own last message.
+    After a restart of its board it continues from its own last message. See `SharedBody`.
     """
 
     others = Inputs(SharedBodies, "lan.shared")
@@ -67,28 +67,32 @@ class SharingServoExecutor(ServoExecutor):
     def misfits(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Misfits:
-        """Yield shared bodies that are no objects or named twice, besides what any servo level
-        finds.
+        """Yield mistakes in the list of shared objects, and the ones of any servo level.
+
+        Args:
+            context: Context of this level.
+            above: Contexts of the levels above.
+            below: Contexts of the levels below.
         """
         names = context.params["shared"]
         scene = context.scene
         for name in dict.fromkeys(names):
             why = ""
             if name not in scene.objects:
-                why = "not in the scene"
+                why = "is not in the scene"
                 if name in scene.obstacles:
-                    why = "an obstacle, which moves by itself"
-                why += f"; objects: {', '.join(scene.objects) or 'none'}"
+                    why = "is an obstacle, which moves by itself"
+                why += f"; valid objects: {', '.join(scene.objects) or 'none'}"
             elif names.count(name) > 1:
-                why = "named twice"
+                why = "is named more than once"
             elif len(name) > NAME_BYTES or not name.isascii():
-                why = f"no name for a message; permitted: ASCII, at most {NAME_BYTES} characters"
+                why = f"does not fit into a message: at most {NAME_BYTES} ASCII characters"
             if why:
                 yield "params.shared", name, why
         yield from super().misfits(context, above, below)
 
     def process(self, tick: int) -> None:
-        """Do the cycle of a servo level, and show the shared objects when it is due."""
+        """Do the cycle of a servo level, and write the shared objects when it is due."""
         if not self._started and self.last.is_there:
             for body in self._shared.values():
                 body.recall(self.last.message)
@@ -99,12 +103,12 @@ class SharingServoExecutor(ServoExecutor):
                 body.show(self.shared.bodies[slot], self.arm.pose(row))
 
     def started(self) -> None:
-        """Keep the grip, and the copies where the restored state has them."""
+        """Keep the grip, and fix copies where the restored state has them."""
         super().started()
         self._keep()
 
     def take_messages(self) -> None:
-        """Take over what is new, of other racks too."""
+        """Read new messages, also from other racks, and update claims and copies."""
         super().take_messages()
         for row, body in self._shared.items():
             for other in self.others.values():
@@ -114,5 +118,6 @@ class SharingServoExecutor(ServoExecutor):
         self._keep()
 
     def _keep(self) -> None:
+        """Fix the copies of objects that other racks move, and release the rest."""
         for row, body in self._shared.items():
             self.arm.keep(row, body.is_elsewhere)

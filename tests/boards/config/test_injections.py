@@ -89,7 +89,7 @@ MISTAKES: Mapping[str, tuple[Fault, str]] = {
     ),
     "condition, name": (
         {"kind": "kill", "board": "wave", "when": "wave.status.state == gone"},
-        "'gone' is not a value of 'state'; permitted: idle, executing, done, error",
+        "'gone' is not a value of 'state'; valid: idle, executing, done, error",
     ),
 }
 PARAMETERS = [(kind, parameter) for kind in KINDS for parameter in kind.parameters]

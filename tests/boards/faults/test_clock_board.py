@@ -142,7 +142,7 @@ def test_a_fault_of_the_clock_that_strikes_once_is_over_a_tick_later(site: Site)
     assert ended == (Alarm.FAULT_ENDS, 6, entry.index, 1.0)
 
 
-def test_messages_are_seen_to_flow_again_after_a_fault_of_them(site: Site) -> None:
+def test_messages_that_flow_again_after_a_message_fault_are_reported(site: Site) -> None:
     writer = open_writer(site.segment, NAME)
     site.add("mute", tick=2, ticks=3)
     site.advance(2)
@@ -160,7 +160,7 @@ def test_messages_are_seen_to_flow_again_after_a_fault_of_them(site: Site) -> No
     assert (site.stage.next_tick, site.advance(11)) == (NEVER, [])
 
 
-def test_a_restarted_clock_awaits_the_messages_that_its_predecessor_did(site: Site) -> None:
+def test_a_restarted_clock_awaits_the_same_messages(site: Site) -> None:
     site.add("mute", tick=2, ticks=3)
     site.advance(2, 5)
     site.segment.words[System.STATE] = Run.RUNNING
@@ -207,7 +207,7 @@ def test_a_kill_needs_a_process_and_waits_until_its_loss_is_known(site: Site) ->
     assert again.count == 0
 
 
-def test_a_hanging_task_goes_on_when_its_fault_ends_and_if_it_is_lost_the_fault_is_over(
+def test_a_hanging_task_continues_at_the_end_of_its_fault_unless_it_is_lost(
     site: Site,
 ) -> None:
     block = site.segment.block("writer")

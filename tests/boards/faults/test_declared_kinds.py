@@ -36,7 +36,7 @@ def drawn(kind: Kind) -> list[list[float]]:
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
-def test_a_kind_declares_what_it_did(kind: Kind) -> None:
+def test_the_declaration_of_each_kind_is_unchanged(kind: Kind) -> None:
     parameters = [declared(parameter) for parameter in kind.parameters]
     told = [declared(kind), parameters, str(kind.bound), kind.number]
     SNAPSHOTS.check(kind.name, {"declared": told, "drawn": drawn(kind)})
@@ -59,7 +59,7 @@ def test_drawn_values_are_permitted_ones(kind: Kind) -> None:
         assert kind.lasts is None or kind.lasts(d) >= 1
 
 
-def test_a_sweep_goes_from_its_least_size_to_well_beyond_the_visible_one() -> None:
+def test_a_sweep_extends_from_the_least_size_beyond_the_visible_size() -> None:
     sizes = swept(0.001, 0.02, 5)
     assert (sizes[0], sizes[-1]) == (0.001, pytest.approx(BEYOND * 0.02))
     ratios = [after / before for before, after in pairwise(sizes)]

@@ -60,7 +60,7 @@ def test_parameters_have_their_units_and_ratios_none(table: FaultTable) -> None:
     assert describe(overrun, layout, JOINTS) == "overrun of writer (by 1.5 cycles, random 0)"
 
 
-def test_a_document_has_what_is_known_at_its_stage(table: FaultTable) -> None:
+def test_a_document_contains_the_ticks_known_at_its_stage(table: FaultTable) -> None:
     entry = table.add(Injection(KINDS["mute"].number, 0, 0, tick=40, ticks=8))
     layout = table._segment.layout
     entry.until = 48

@@ -36,7 +36,7 @@ def fault(keys: str) -> str:
     return f'fault=[{{ kind = "lose-every", board = "wave", {keys} }}]'
 
 
-def test_a_kind_of_a_users_own_is_listed_with_its_bound_and_parameters(config: MakeConfig) -> None:
+def test_a_users_kind_is_listed_with_its_bound_and_parameters(config: MakeConfig) -> None:
     wire(config(text=GAUGED))
     lines = [line.split("  ") for line in kinds_text() if line.startswith("lose-every ")]
     kind, parameter = ([cell.strip() for cell in line if cell] for line in lines)
@@ -45,7 +45,7 @@ def test_a_kind_of_a_users_own_is_listed_with_its_bound_and_parameters(config: M
 
 
 @pytest.mark.parametrize("valve", ["open", "OPEN", "3"])
-def test_a_fault_begins_when_a_field_has_a_value_of_a_users_own_enum(
+def test_a_fault_begins_when_a_field_has_a_value_of_a_users_enum(
     config: MakeConfig, valve: str
 ) -> None:
     found = config(fault(f'cycles = 80, when = "wave.status.valve == {valve}"'), text=GAUGED)
@@ -59,7 +59,7 @@ def test_a_fault_begins_when_a_field_has_a_value_of_a_users_own_enum(
 
 
 @pytest.mark.slow
-def test_a_kind_of_a_users_own_acts_and_is_detected(config: MakeConfig) -> None:
+def test_a_users_kind_acts_and_is_detected(config: MakeConfig) -> None:
     with Rack(
         config(fault('cycles = 80, n = 4, when = "wave.status.valve == open"'), text=GAUGED)
     ) as rack:
@@ -74,13 +74,13 @@ def test_a_kind_of_a_users_own_acts_and_is_detected(config: MakeConfig) -> None:
 
 
 def test_two_kinds_of_one_name_are_refused() -> None:
-    with pytest.raises(ValueError, match="kind 'kill': already taken by 'kill'"):
+    with pytest.raises(ValueError, match="kind 'kill' has the number of 'kill'; rename it"):
         KINDS.add(Kind("kill", "process", "", (), cycles(1)))
 
 
 def test_a_kind_has_no_more_parameters_than_an_entry_of_the_fault_table_holds() -> None:
     nine = tuple(Parameter(f"p{at}", "1", "a number", 0, 0, 1) for at in range(9))
-    with pytest.raises(ValueError, match="kind 'many': 9 parameters; permitted: 8"):
+    with pytest.raises(ValueError, match="kind 'many' has 9 parameters; at most 8 are allowed"):
         KINDS.add(Kind("many", "process", "", (), cycles(1), parameters=nine))
 
 

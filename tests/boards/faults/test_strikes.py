@@ -47,13 +47,13 @@ CASES = [
 
 
 @pytest.mark.parametrize("kind", ["kill", "hang"])
-def test_a_fault_at_the_first_tick_strikes_as_later(kind: str, config: MakeConfig) -> None:
+def test_a_fault_at_the_first_tick_acts_like_a_later_one(kind: str, config: MakeConfig) -> None:
     struck = faulty(config(text=FOLLOWED), {"kind": kind, "board": "wave", "tick": 0})
     SNAPSHOTS.check(f"{kind} at the first tick", in_short(whole_run(struck, SECONDS)))
 
 
 @pytest.mark.parametrize(("kind", "rack"), CASES)
-def test_a_fault_strikes_as_it_did(kind: Kind, rack: str, config: MakeConfig) -> None:
+def test_the_effect_of_each_fault_is_unchanged(kind: Kind, rack: str, config: MakeConfig) -> None:
     settings = [LOCKED] if kind.where == "lock" else []
     struck = faulty(config(*settings, text=RACKS[rack]), *faults(kind))
     parts = dict(whole_run(struck, SECONDS))

@@ -84,7 +84,7 @@ def test_what_goes_out_is_this_racks_own() -> None:
     assert "rack/home/out/pulse/status" in out
 
 
-def test_whoever_may_stop_it_may_do_nothing_else() -> None:
+def test_an_operator_with_the_right_to_stop_has_no_other_right() -> None:
     stop = "rack/viewer/estop/home"
     seen = ("rack/*/alive/*", "rack/home/alive/*")
     assert {rule[:3] for rule in rules(TLS, estop_from=["viewer"])} == {
@@ -104,5 +104,5 @@ def test_a_token_names_launch_and_cycle(cycle_ns: int) -> None:
 @pytest.mark.parametrize(
     "launch", ["x", "ab", "-20", f"{1:016x}-", f"{1:016x}-x", f"{1:016x}-{10**18}", f"{1:017x}"]
 )
-def test_a_token_that_no_adapter_has_made_is_none(launch: str) -> None:
+def test_a_token_that_no_adapter_declares_is_not_parsed(launch: str) -> None:
     assert launch_and_cycle(f"rack/home/alive/{launch}") is None

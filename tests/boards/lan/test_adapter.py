@@ -63,7 +63,7 @@ def make(rack_name: str, tmp_path: Path) -> Iterator[MakeAdapter]:
         yield make_one
 
 
-def test_a_lost_rack_stops_the_arm_at_once_and_one_that_is_back_lets_it_go(
+def test_a_lost_rack_stops_the_arm_until_it_is_back(
     make: MakeAdapter,
 ) -> None:
     changes: list[Change] = []
@@ -95,7 +95,7 @@ def test_in_lockstep_a_demand_counts_from_the_next_cycle(make: MakeAdapter) -> N
     assert [is_on(word, tick) for tick in (16 + EVERY - 1, 16 + EVERY)] == [False, True]
 
 
-def test_where_a_rack_is_to_go_on_alone_no_loss_stops_the_arm(make: MakeAdapter) -> None:
+def test_a_lost_rack_does_not_stop_the_arm_if_the_config_says_go_on(make: MakeAdapter) -> None:
     changes: list[Change] = [("b", FIRST, True), ("b", FIRST, False)]
     adapter, segment = make(changes, 'on_peer_loss = "go on"')
     adapter._look(8)
@@ -103,7 +103,7 @@ def test_where_a_rack_is_to_go_on_alone_no_loss_stops_the_arm(make: MakeAdapter)
     assert segment.words[System.PEER_STOP] == 0
 
 
-def test_a_rack_that_comes_is_sent_everything_anew(make: MakeAdapter) -> None:
+def test_a_rack_that_joins_is_sent_every_newest_message(make: MakeAdapter) -> None:
     changes: list[Change] = []
     adapter, _ = make(changes)
     (export,) = adapter._exports.values()
@@ -127,7 +127,7 @@ IMPORTED = {
 }
 
 
-def test_what_keeps_the_exchange_from_its_work_is_said(make: MakeAdapter) -> None:
+def test_the_status_says_why_the_exchange_is_incomplete(make: MakeAdapter) -> None:
     changes: list[Change] = []
     adapter, _ = make(changes)
 
@@ -154,7 +154,7 @@ def test_what_keeps_the_exchange_from_its_work_is_said(make: MakeAdapter) -> Non
     assert said(unknown + 41) == "'b/pulse.status' is older than max_age_ms"
 
 
-def test_in_real_time_the_status_counts_what_the_seals_refused(make: MakeAdapter) -> None:
+def test_in_real_time_the_status_counts_messages_with_flaws(make: MakeAdapter) -> None:
     adapter, _ = make([])
     # What is imported needs a link to be counted.
     adapter._imports.clear()

@@ -97,7 +97,7 @@ def test_a_rack_exports_nothing_for_another(segment: Segment) -> None:
     }
 
 
-def test_what_was_passed_on_before_a_restart_is_not_passed_on_again(segment: Segment) -> None:
+def test_exports_delivered_before_a_restart_are_not_delivered_again(segment: Segment) -> None:
     segment.block("lan")[Block.DONE] = 2 * EVERY
     barrier, session = opened(segment)
     take = barrier.subscribe(KEYS["two"])
@@ -113,7 +113,7 @@ def step(time_ns: int, flags: int = 0) -> Step:
     return Step(HEAD._replace(launch=7, time_ns=time_ns, flags=flags), 8, ["a"], [])
 
 
-def test_steps_are_passed_on_once_and_up_to_a_time() -> None:
+def test_steps_are_delivered_once_and_up_to_a_time() -> None:
     partner = Partner("b", 3)
     for time_ns in (8, 16, 16, 8, 24):
         partner.take(step(time_ns))
@@ -123,7 +123,7 @@ def test_steps_are_passed_on_once_and_up_to_a_time() -> None:
     assert [passed.head.time_ns for passed in partner.passed(100)] == [24]
 
 
-def test_a_rack_that_is_over_is_awaited_no_more_until_it_sends_again() -> None:
+def test_a_rack_that_has_ended_is_not_awaited_until_it_sends_again() -> None:
     partner = Partner("b", 3)
     partner.gone_s = 1.0
     partner.take(step(8, StepFlag.OVER))
@@ -141,7 +141,7 @@ def test_the_word_says_why_it_is_awaited() -> None:
     assert partner.word == word_of(3, Why.GONE)
 
 
-def test_a_rack_that_is_forgotten_is_awaited_as_at_first() -> None:
+def test_a_partner_that_is_reset_is_awaited_as_at_first() -> None:
     partner = Partner("b", 3)
     partner.launch = 7
     partner.gone_s = 1.0
@@ -174,7 +174,7 @@ def test_an_export_without_an_envelope_arrives_with_an_empty_one() -> None:
     assert step.exports == [Arrived("a", b"", b"payload")]
 
 
-def test_what_is_cut_off_continued_or_of_another_kind_is_no_step() -> None:
+def test_truncated_extended_or_foreign_content_is_not_a_step() -> None:
     content = pack_step(5_000_000, ("puma",), EXPORTS)
     assert [
         length for length in range(len(content)) if unpack_step(HEAD, content[:length]) is not None

@@ -106,13 +106,13 @@ def test_a_clock_that_steps_begins_a_new_estimate(step: int) -> None:
 @pytest.mark.parametrize(
     "bad", [RoundTrip(100, 0, 500, 200), RoundTrip(200, 0, 0, 100), RoundTrip(100, 500, 400, 200)]
 )
-def test_what_cannot_be_a_round_trip_is_refused(bad: RoundTrip) -> None:
+def test_an_impossible_round_trip_is_refused(bad: RoundTrip) -> None:
     found = ClockOffset()
     assert not found.add(bad)
     assert found.best is None
 
 
-def test_what_was_measured_of_an_earlier_launch_is_forgotten() -> None:
+def test_measurements_of_an_earlier_launch_are_discarded() -> None:
     peer = PeerRack("b")
     peer.comes(7, 0)
     clock = PeerClock(peer)
@@ -138,7 +138,7 @@ def segment(rack_name: str) -> Iterator[Segment]:
     unlink(rack_name)
 
 
-def test_a_message_counts_as_old_as_it_may_be(segment: Segment) -> None:
+def test_a_message_never_counts_as_younger_than_it_is(segment: Segment) -> None:
     segment.words[System.PERIOD_NS] = PERIOD_NS
     segment.words[System.EPOCH_NS] = 100 * S
     grid, peer = OwnGrid(segment, 1), PeerRack("b")
@@ -290,7 +290,7 @@ def wire(segment: Segment) -> Wire:
     return Wire(segment)
 
 
-def test_a_rack_is_asked_often_until_its_clock_is_known_and_seldom_then(
+def test_a_rack_is_pinged_often_until_its_clock_is_known(
     wire: Wire, segment: Segment, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now = [time.monotonic_ns()]
@@ -334,7 +334,7 @@ def test_an_answer_is_taken_once_and_gives_offset_and_grid(wire: Wire, segment: 
         {"more": b"x"},
     ],
 )
-def test_what_is_no_answer_to_a_ping_is_refused(
+def test_an_unexpected_answer_is_refused(
     wire: Wire, segment: Segment, wrong: dict[str, Any]
 ) -> None:
     wire.take()
@@ -344,13 +344,13 @@ def test_what_is_no_answer_to_a_ping_is_refused(
     assert wire.take() == (1, 1)
 
 
-def test_a_rack_that_is_not_there_is_not_asked(wire: Wire) -> None:
+def test_an_absent_rack_is_not_pinged(wire: Wire) -> None:
     wire.peers["b"].goes(OTHER, 1)
     wire.take()
     assert wire.sent == []
 
 
-def test_of_pings_without_answers_the_newest_are_remembered(
+def test_only_the_newest_unanswered_pings_are_remembered(
     wire: Wire, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock = wire.clocks._clocks["b"]

@@ -35,7 +35,7 @@ def test_a_restarted_reader_takes_nothing_twice() -> None:
     assert count.missing == 2
 
 
-def test_a_restarted_sender_may_give_one_number_twice() -> None:
+def test_a_restarted_sender_may_use_one_number_twice() -> None:
     found, count = order()
     assert found.admits(head(20, serial=60))
     assert found.admits(head(20, serial=64))
@@ -43,7 +43,7 @@ def test_a_restarted_sender_may_give_one_number_twice() -> None:
     assert (count.missing, count.disordered, count.repeated) == (0, 0, 0)
 
 
-def test_a_reader_resumed_without_launches_goes_on() -> None:
+def test_a_reader_restored_without_a_launch_continues() -> None:
     found, count = order(0, 20, 60)
     assert not found.admits(head(20))
     assert found.admits(head(21))
@@ -52,7 +52,7 @@ def test_a_reader_resumed_without_launches_goes_on() -> None:
 
 
 @given(st.lists(st.integers(0, 30), min_size=1, max_size=60))
-def test_every_message_is_new_disordered_or_repeated_and_what_never_came_is_the_rest(
+def test_every_message_counts_as_new_disordered_repeated_or_missing(
     numbers: list[int],
 ) -> None:
     found, count = order()
@@ -64,7 +64,7 @@ def test_every_message_is_new_disordered_or_repeated_and_what_never_came_is_the_
     assert count.missing - count.disordered == max(came) - first + 1 - len(set(came))
 
 
-def test_what_comes_after_the_window_is_bounded() -> None:
+def test_messages_older_than_the_window_are_counted_within_bounds() -> None:
     found, count = order()
     assert found.admits(head(1))
     assert found.admits(head(WINDOW * 4))
@@ -73,7 +73,7 @@ def test_what_comes_after_the_window_is_bounded() -> None:
     assert count.disordered == 2
 
 
-def test_a_number_that_a_restarted_sender_gives_twice_moves_nothing() -> None:
+def test_a_number_used_twice_by_a_restarted_sender_changes_no_other_count() -> None:
     found, count = order()
     assert [found.admits(head(number)) for number in (2, 4, 5)] == [True] * 3
     assert found.admits(head(5, serial=16))
@@ -85,7 +85,7 @@ def test_a_number_that_a_restarted_sender_gives_twice_moves_nothing() -> None:
     assert (count.disordered, count.repeated) == (1, 1)
 
 
-def test_a_number_given_twice_takes_no_place_of_one_that_is_missing() -> None:
+def test_a_number_used_twice_does_not_hide_a_missing_one() -> None:
     found, count = order()
     assert found.admits(head(18, serial=54))
     assert found.admits(head(20, serial=60))

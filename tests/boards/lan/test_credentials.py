@@ -44,7 +44,7 @@ def flaws(folder: Path, rack: str = "cell", *addresses: str) -> list[str]:
 
 
 def test_every_missing_file_is_named(tmp_path: Path) -> None:
-    why = "missing; see rack lan certificates --help"
+    why = "the file is missing; see rack lan certificates --help"
     assert flaws(tmp_path) == [
         f"{name}: {why}" for name in ("authority.pem", "cell.pem", "cell-key.pem")
     ]
@@ -61,25 +61,28 @@ def test_a_file_that_cannot_be_read_is_named(folder: Path) -> None:
     ]
 
 
-def test_what_others_may_read_is_refused(folder: Path) -> None:
+def test_a_key_that_others_can_read_is_refused(folder: Path) -> None:
     (folder / "cell-key.pem").chmod(0o640)
-    assert flaws(folder) == ["cell-key.pem: others may read it, mode 0640; permitted: 0600"]
+    assert flaws(folder) == ["cell-key.pem: mode 0640 lets others read it; it must be 0600"]
 
 
 def test_a_certificate_is_for_one_rack(folder: Path) -> None:
     shutil.copy(folder / "puma.pem", folder / "cell.pem")
     shutil.copy(folder / "puma-key.pem", folder / "cell-key.pem")
-    assert flaws(folder) == ["cell.pem: for 'puma', not for rack 'cell'"]
+    assert flaws(folder) == ["cell.pem: the certificate is for 'puma' instead of rack 'cell'"]
 
 
 def test_a_certificate_is_for_the_addresses_on_which_the_rack_listens(made: Path) -> None:
     (flaw,) = flaws(made, "cell", "10.0.0.1", "10.0.0.9")
-    assert flaw == "cell.pem: not for address 10.0.0.9; for 10.0.0.1, cell.local"
+    assert flaw == (
+        "cell.pem: the certificate is not valid for address 10.0.0.9;"
+        " valid addresses: 10.0.0.1, cell.local"
+    )
 
 
-def test_the_key_must_be_that_of_the_certificate(folder: Path) -> None:
+def test_the_key_must_belong_to_the_certificate(folder: Path) -> None:
     shutil.copy(folder / "puma-key.pem", folder / "cell-key.pem")
-    assert flaws(folder) == ["cell-key.pem: not the key of cell.pem"]
+    assert flaws(folder) == ["cell-key.pem: the key does not belong to cell.pem"]
 
 
 def test_a_key_with_a_password_is_refused(folder: Path) -> None:
@@ -88,23 +91,23 @@ def test_a_key_with_a_password_is_refused(folder: Path) -> None:
     locked = serialization.BestAvailableEncryption(b"word")
     form = serialization.PrivateFormat.PKCS8
     path.write_bytes(key.private_bytes(serialization.Encoding.PEM, form, locked))
-    assert flaws(folder) == ["cell-key.pem: encrypted; permitted: a key without a password"]
+    assert flaws(folder) == ["cell-key.pem: the key is encrypted; it must have no password"]
 
 
-def test_another_authority_has_not_signed_it(folder: Path, tmp_path: Path) -> None:
+def test_a_certificate_of_another_authority_is_refused(folder: Path, tmp_path: Path) -> None:
     make_credentials(tmp_path / "other", NAMES, 2)
     shutil.copy(tmp_path / "other/authority.pem", folder / "authority.pem")
-    assert flaws(folder) == ["cell.pem: not signed by authority.pem"]
+    assert flaws(folder) == ["cell.pem: the certificate is not signed by authority.pem"]
 
 
 @pytest.mark.parametrize("name", ["authority.pem", "cell.pem", "cell-key.pem"])
 @pytest.mark.parametrize(
     "content", [b"nothing", b"-----BEGIN CERTIFICATE-----\nAAAA\n-----END CERTIFICATE-----\n"]
 )
-def test_what_is_not_pem_is_refused(folder: Path, name: str, content: bytes) -> None:
+def test_files_that_are_not_pem_are_refused(folder: Path, name: str, content: bytes) -> None:
     (folder / name).write_bytes(content)
     kind = "private key" if "key" in name else "certificate"
-    assert f"{name}: no {kind} in PEM form" in flaws(folder)
+    assert f"{name}: the file contains no {kind} in PEM form" in flaws(folder)
 
 
 def test_a_key_of_another_kind_is_refused(folder: Path) -> None:
@@ -114,15 +117,18 @@ def test_a_key_of_another_kind_is_refused(folder: Path) -> None:
         path = folder / "cell-key.pem"
         path.write_bytes(key.private_bytes(serialization.Encoding.PEM, form, none))
         assert flaws(folder) == [
-            "cell-key.pem: of another kind; permitted: a key on the curve P-256"
+            "cell-key.pem: the key is of another kind; it must be on the curve P-256"
         ]
 
 
 @pytest.mark.parametrize(
     ("begins", "ends", "why"),
-    [(-2, -1, "cell.pem: expired on 20"), (1, 2, "cell.pem: not valid before 20")],
+    [
+        (-2, -1, "cell.pem: the certificate expired on 20"),
+        (1, 2, "cell.pem: the certificate is not valid before 20"),
+    ],
 )
-def test_a_certificate_of_other_days_is_refused(
+def test_a_certificate_that_is_not_valid_now_is_refused(
     folder: Path, begins: int, ends: int, why: str
 ) -> None:
     now = datetime.now(UTC)
@@ -163,7 +169,8 @@ def step(
 
 
 @pytest.mark.parametrize(
-    ("below", "expected"), [(0, []), (None, ["cell.pem: not signed by authority.pem"])]
+    ("below", "expected"),
+    [(0, []), (None, ["cell.pem: the certificate is not signed by authority.pem"])],
 )
 def test_an_authority_may_sign_through_another_but_not_through_a_rack(
     tmp_path: Path, below: int | None, expected: list[str]

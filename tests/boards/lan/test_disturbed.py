@@ -149,9 +149,7 @@ def racks(lab: Lab, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[
 
 
 @pytest.mark.slow
-def test_no_message_is_missing_and_no_rack_is_lost_when_packets_are(
-    lab: Lab, racks: tuple[LabRack, LabRack]
-) -> None:
+def test_lost_packets_lose_no_message_and_no_rack(lab: Lab, racks: tuple[LabRack, LabRack]) -> None:
     before = [rack.counts() for rack in racks]
     lab.lose(1, LOSS)
     for rack in racks:
@@ -198,7 +196,7 @@ def test_a_pulled_cable_is_seen_within_the_lease_by_both_and_nothing_old_counts_
 
 
 @pytest.mark.slow
-def test_a_killed_rack_is_lost_and_its_next_launch_is_told_from_it(
+def test_a_killed_rack_is_lost_and_its_next_launch_is_distinguished(
     racks: tuple[LabRack, LabRack],
 ) -> None:
     killed, other = racks[1], racks[0]

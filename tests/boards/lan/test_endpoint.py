@@ -34,8 +34,8 @@ def test_an_endpoint_has_a_protocol_a_host_and_a_port(
         *("tcp/127.1:1", "tcp/300:1", "tcp/1.2.3.400:1", "tcp/[1::2::3]:1"),
     ],
 )
-def test_what_is_none_is_refused(text: str) -> None:
-    with pytest.raises(ValueError, match="permitted: tcp/, tls/ or quic/"):
+def test_a_malformed_endpoint_is_refused(text: str) -> None:
+    with pytest.raises(ValueError, match="must be tcp/, tls/ or quic/"):
         Endpoint.of(text)
 
 
@@ -51,7 +51,9 @@ def test_what_is_none_is_refused(text: str) -> None:
         ("localhost.lab", False, False),
     ],
 )
-def test_who_reaches_it(host: str, is_loopback: bool, is_everywhere: bool) -> None:
+def test_an_endpoint_knows_who_can_reach_it(
+    host: str, is_loopback: bool, is_everywhere: bool
+) -> None:
     endpoint = Endpoint.of(f"tcp/{host}:7447")
     assert (endpoint.is_loopback, endpoint.is_everywhere) == (is_loopback, is_everywhere)
 

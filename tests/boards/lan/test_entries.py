@@ -139,7 +139,7 @@ def test_a_message_is_new_once_then_old_then_lost_by_its_age(importing: Importin
     assert importing.read(72) == (NEW, 2, False)
 
 
-def test_what_is_too_old_when_it_comes_is_counted_and_not_passed(importing: Importing) -> None:
+def test_a_message_that_arrives_too_old_is_counted_and_not_delivered(importing: Importing) -> None:
     importing.send(1, written=0)
     importing.cycle(MAX_AGE)
     assert importing.counts() == {"taken": 1}
@@ -149,7 +149,7 @@ def test_what_is_too_old_when_it_comes_is_counted_and_not_passed(importing: Impo
     assert importing.read(MAX_AGE + 16)[1] == 1
 
 
-def test_the_newest_of_several_is_passed(importing: Importing) -> None:
+def test_only_the_newest_of_several_messages_is_delivered(importing: Importing) -> None:
     for number in (3, 5, 4, 4, 5):
         importing.send(number, written=number)
     importing.cycle(8)
@@ -164,7 +164,7 @@ def test_the_newest_of_several_is_passed(importing: Importing) -> None:
     assert importing.read(17)[0] is OLD
 
 
-def test_what_is_no_message_of_this_mailbox_is_refused(importing: Importing) -> None:
+def test_a_message_of_another_mailbox_is_refused(importing: Importing) -> None:
     importing.send(1, written=1, kind=1)
     importing.send(2, written=1, serial=1 << 63)
     importing.send(3, written=1, launch=1 << 63)
@@ -182,7 +182,7 @@ def test_what_is_no_message_of_this_mailbox_is_refused(importing: Importing) -> 
     assert importing.read(16) == (NEW, 4, False)
 
 
-def test_a_number_of_any_size_leaves_the_count_of_what_is_missing_at_its_greatest(
+def test_the_count_of_missing_messages_saturates(
     importing: Importing,
 ) -> None:
     for number in (1, 1 << 32, (1 << 62) - 1):
@@ -194,7 +194,7 @@ def test_a_number_of_any_size_leaves_the_count_of_what_is_missing_at_its_greates
     )
 
 
-def test_a_lost_rack_is_lost_at_once_until_its_first_message_after_that(
+def test_a_lost_rack_stays_lost_until_its_next_message(
     importing: Importing,
 ) -> None:
     importing.send(1, written=2)
@@ -217,7 +217,7 @@ def test_a_lost_rack_is_lost_at_once_until_its_first_message_after_that(
 
 
 @pytest.mark.parametrize("segment", ["realtime"], indirect=True)
-def test_a_rack_that_goes_on_keeps_the_last_message_however_old(segment: Segment) -> None:
+def test_with_go_on_levels_keep_the_last_message_however_old(segment: Segment) -> None:
     importing = Importing(segment, goes_on=True)
     importing.peer.comes(LAUNCH, 0)
     importing.peer.offset_ns = 0
@@ -321,7 +321,7 @@ def test_a_message_whose_age_is_unknown_waits_for_the_clocks(importing: Importin
 
 
 @pytest.mark.parametrize("segment", ["lockstep"], indirect=True)
-def test_in_lockstep_nothing_that_differs_from_run_to_run_is_on_record(
+def test_in_lockstep_nothing_that_differs_between_runs_is_recorded(
     importing: Importing,
 ) -> None:
     importing.send(1, written=2)
@@ -338,7 +338,7 @@ def test_a_clock_that_is_ahead_makes_nothing_younger_than_now(importing: Importi
 
 
 @pytest.mark.parametrize("segment", ["realtime"], indirect=True)
-def test_what_was_written_before_the_first_tick_here_is_as_old_as_it_is(
+def test_a_message_from_before_the_first_tick_keeps_its_age(
     importing: Importing,
 ) -> None:
     importing.send(1, written=-20)

@@ -58,7 +58,7 @@ def sealer(folder: Path, request: pytest.FixtureRequest) -> Sealer:
 @pytest.mark.slow
 @UNTIMED
 @given(st.text(), HEADS, PAYLOADS)
-def test_what_was_sealed_is_opened_unchanged(
+def test_a_sealed_message_is_opened_unchanged(
     sealer: Sealer, end: str, head: Envelope, payload: bytes
 ) -> None:
     key = KEY + end
@@ -141,7 +141,7 @@ def test_a_spoilt_certificate_names_nobody_else(folder: Path) -> None:
     assert own.identity(chain + chain[:-1]) is None
 
 
-def test_each_key_is_sealed_by_the_one_in_whose_name_it_is() -> None:
+def test_each_key_is_sealed_by_the_sender_that_it_names() -> None:
     assert sender_of(estop_key("operator", "cell")) == "operator"
     answer = estop_answer_key("cell", "operator")
     for key in (KEY, out_key("cell", "ask.a"), step_key("cell"), ping_key("cell", "puma"), answer):
@@ -174,7 +174,7 @@ def test_no_rack_makes_the_seal_of_another(folder: Path) -> None:
     assert sealer.opened(KEY, sealer.seal(KEY, HEAD, b""), b"") == HEAD
 
 
-def test_a_seal_is_worth_no_more_than_its_certificate(
+def test_a_seal_with_an_invalid_certificate_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     make_credentials(tmp_path, {"cell": []}, 1)

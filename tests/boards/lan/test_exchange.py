@@ -182,7 +182,7 @@ def test_the_threads_of_the_network_have_core_and_priority_of_the_adapter(
 
 
 @pytest.mark.alone
-def test_a_flood_costs_a_bounded_number_of_looks_and_other_entries_go_on(
+def test_a_flood_costs_bounded_work_and_other_entries_continue(
     rack_name: str, tmp_path: Path
 ) -> None:
     (at,) = endpoints(1)

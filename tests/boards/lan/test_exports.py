@@ -58,7 +58,7 @@ def test_each_new_message_is_sent_once(segment: Segment) -> None:
     assert heads[1].stamp_ns == 16 * 2_500_000
 
 
-def test_what_an_adapter_before_this_one_sent_in_its_last_cycle_is_sent_again(
+def test_the_last_message_before_a_restart_is_sent_again(
     segment: Segment,
 ) -> None:
     exporting = Exporting(segment)
@@ -77,7 +77,7 @@ def test_what_an_adapter_before_this_one_sent_in_its_last_cycle_is_sent_again(
         assert exporting.entry.count.sent == 2
 
 
-def test_whoever_comes_gets_the_newest_though_it_is_not_new(segment: Segment) -> None:
+def test_a_rack_that_joins_gets_the_newest_message_again(segment: Segment) -> None:
     exporting = Exporting(segment)
     exporting.writer.write(0)
     exporting.entry.exchange(8)
@@ -90,7 +90,7 @@ def test_whoever_comes_gets_the_newest_though_it_is_not_new(segment: Segment) ->
     assert exporting.entry.count.sent == 1
 
 
-def test_a_restarted_adapter_goes_on_with_the_numbers_of_the_one_before(segment: Segment) -> None:
+def test_a_restarted_adapter_continues_the_numbers(segment: Segment) -> None:
     exporting = Exporting(segment)
     for tick in (0, 8, 16):
         exporting.writer.write(tick)

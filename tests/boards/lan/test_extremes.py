@@ -181,7 +181,7 @@ def check(found: Ended, counts: Mapping[str, int]) -> None:
     assert all(entry["taken"] > 0 for entry in imports.values())
 
 
-def test_all_types_that_shipped_racks_import_are_tried() -> None:
+def test_every_type_that_shipped_racks_import_is_tested() -> None:
     texts = [path.read_text() for path in CONFIGS.rglob("*.toml")]
     found = [
         re.findall(r"\[adapter\.lan\.import\.[^]]*\][^[]*?\ntype = \"(.*)\"", text)

@@ -59,7 +59,7 @@ def restarted(peer: PeerRack, confirm_by: int) -> PeerRack:
     return after
 
 
-def test_a_restarted_adapter_goes_on_with_the_same_launch() -> None:
+def test_a_restarted_adapter_continues_with_the_same_launch() -> None:
     peer = PeerRack("b")
     peer.comes(OLD, 5)
     after = restarted(peer, 100)
@@ -79,7 +79,7 @@ def test_a_restarted_adapter_goes_on_with_the_same_launch() -> None:
     assert after.confirm_by < 0
 
 
-def test_a_rack_that_ended_while_the_adapter_was_away_is_lost_in_time() -> None:
+def test_a_rack_that_ended_during_a_restart_is_lost_in_time() -> None:
     peers = Peers(["b"])
     there = PeerRack("b")
     there.comes(OLD, 5)
@@ -130,7 +130,7 @@ def test_in_lockstep_the_message_of_a_peer_depends_on_ticks_alone_also_after_a_r
 
 @pytest.mark.slow
 @given(st.lists(st.tuples(st.integers(1, 4), st.booleans()), max_size=40))
-def test_a_rack_is_there_exactly_if_a_launch_that_is_not_over_is(
+def test_a_rack_is_present_exactly_if_a_current_launch_is(
     steps: list[tuple[int, bool]],
 ) -> None:
     peer, tokens = PeerRack("b"), set[int]()

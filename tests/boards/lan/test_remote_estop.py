@@ -140,7 +140,7 @@ def test_a_check_is_answered_and_sets_nothing(bench: Bench) -> None:
     assert not bench.findings
 
 
-def test_what_is_not_permitted_malformed_or_unsigned_is_not_answered(bench: Bench) -> None:
+def test_forbidden_malformed_and_unsigned_requests_get_no_answer(bench: Bench) -> None:
     line = bench.line
     line.ask("nobody")
     line.ask(payload=b"x")
@@ -154,7 +154,7 @@ def test_what_is_not_permitted_malformed_or_unsigned_is_not_answered(bench: Benc
     assert bench.counts == (0, 1, 6)
 
 
-def test_nobody_asks_in_the_name_of_another(bench: Bench, tmp_path: Path) -> None:
+def test_nobody_can_request_a_stop_under_another_name(bench: Bench, tmp_path: Path) -> None:
     names = (bench.segment.rack, *ASKERS)
     make_credentials(tmp_path, dict.fromkeys(names, ()), 1)
     rack, operator, second = (Sealer(Credentials(tmp_path, name)) for name in names)
@@ -171,7 +171,7 @@ def test_nobody_asks_in_the_name_of_another(bench: Bench, tmp_path: Path) -> Non
     assert bench.is_stopped
 
 
-def test_a_desk_counts_on_from_its_predecessor_and_in_lockstep_shows_nothing(
+def test_counters_continue_after_a_restart_and_are_empty_in_lockstep(
     bench: Bench,
 ) -> None:
     group = np.zeros((), [("answered", "u4"), ("refused", "u4"), ("dropped", "u4")])

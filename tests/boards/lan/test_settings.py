@@ -31,7 +31,7 @@ TABLES: dict[str, dict[str, Any]] = {
 
 @pytest.mark.parametrize("is_operator", [False, True])
 @pytest.mark.parametrize("name", TABLES)
-def test_the_network_is_permitted_what_it_was(name: str, is_operator: bool) -> None:
+def test_the_session_settings_are_unchanged(name: str, is_operator: bool) -> None:
     table = LanTable.model_validate(TABLES[name])
     parts = {
         "access": access_control("home", table, is_operator),

@@ -231,7 +231,7 @@ NOTHING = {"heard": {}, "tokens": {}, "answers": {}}
 
 
 @pytest.mark.slow
-def test_a_friend_is_heard_answered_and_shown_who_is_there(found: Found) -> None:
+def test_a_permitted_rack_is_heard_answered_and_sees_who_is_present(found: Found) -> None:
     assert found.home["good"][pulse("friend")] == found.home["came"][pulse("friend")]
     assert set(found.of["friend"]["tokens"]) >= {TOKEN}
     assert "friend came" in found.home["tokens"]
@@ -243,14 +243,14 @@ def test_a_friend_is_heard_answered_and_shown_who_is_there(found: Found) -> None
     # The impostor's certificate is ours, but for another address.
     [("bare", False), ("plain", False), ("forged", False), ("impostor", False), ("nobody", True)],
 )
-def test_without_a_certificate_and_a_right_of_ours_nobody_gets_anything(
+def test_nobody_gets_anything_without_a_certificate_and_a_right(
     found: Found, name: str, connected: bool
 ) -> None:
     assert found.of[name] == {**NOTHING, "connected": connected}
 
 
 @pytest.mark.slow
-def test_whoever_may_stop_it_may_do_nothing_else_and_nobody_else_may(found: Found) -> None:
+def test_an_operator_may_only_stop_the_rack_and_nobody_else_may(found: Found) -> None:
     viewer = found.of["viewer"]
     assert set(viewer["answers"]) == {STOP}
     assert viewer["heard"] == {}
@@ -260,7 +260,7 @@ def test_whoever_may_stop_it_may_do_nothing_else_and_nobody_else_may(found: Foun
 
 
 @pytest.mark.slow
-def test_nobody_sends_under_another_name_or_with_a_wrong_seal_or_too_much(found: Found) -> None:
+def test_wrong_names_wrong_seals_and_oversized_messages_are_refused(found: Found) -> None:
     home, second, heavy = found.home, out_key("liar", "second.status"), pulse("heavy")
     # Friend sends 100 bytes, all others 99 under its key: those would be good.
     assert set(home["came"]) == {out_key(*source.split("/")) for source in IMPORTED}
@@ -277,7 +277,7 @@ def test_nobody_sends_under_another_name_or_with_a_wrong_seal_or_too_much(found:
 
 
 @pytest.mark.slow
-def test_a_friend_may_come_over_quic(tmp_path: Path) -> None:
+def test_a_permitted_rack_can_connect_over_quic(tmp_path: Path) -> None:
     with at_home(tmp_path, "quic") as site:
         settings = site.mutual("friend") | {"connect/endpoints": [f"quic/127.0.0.1:{site.port}"]}
         assert site.home.state()["came"] == {}

@@ -146,7 +146,10 @@ def test_boards_killed_from_outside_are_found_and_come_back(small: Path, tmp_pat
 @pytest.mark.parametrize(
     ("options", "line"),
     [
-        (["--seconds", "9", "--kinds", "murder"], "--kinds murder: no such kind; kinds: kill, "),
+        (
+            ["--seconds", "9", "--kinds", "murder"],
+            "--kinds murder: there is no such kind; valid kinds: kill, ",
+        ),
         (["--lockstep", "--realtime"], "--lockstep and --realtime: they exclude each other"),
         (
             ["--kills", "3", "--kinds", "kill"],

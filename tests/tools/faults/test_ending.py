@@ -51,7 +51,7 @@ def write(segment: Segment, name: str, **fields: object) -> None:
     writer.close()
 
 
-def test_the_last_states_of_levels_are_told_with_their_reasons(
+def test_the_last_states_of_levels_are_reported_with_their_reasons(
     make_bus: MakeBus,  # noqa: F811
 ) -> None:
     segment = make_bus(*BOXES, *TASKS)
@@ -63,7 +63,7 @@ def test_the_last_states_of_levels_are_told_with_their_reasons(
     assert levels_of(segment) == "task error (no path), servo executing"
 
 
-def test_only_a_level_that_gave_up_for_its_time_is_late(
+def test_only_a_level_that_gave_up_because_of_a_time_is_late(
     make_bus: MakeBus,  # noqa: F811
 ) -> None:
     segment = make_bus(*BOXES, *TASKS)
@@ -91,7 +91,7 @@ def test_the_arm_is_as_its_board_last_reported_it(
         assert (end.violations, end.touches, end.is_at_rest) == (3, 2, rests)
 
 
-def test_strikes_are_the_table_s_and_a_kill_from_outside_is_one_too(
+def test_strikes_come_from_the_fault_table_and_from_outside_kills(
     make_bus: MakeBus,  # noqa: F811
 ) -> None:
     segment = make_bus(*BOXES, *TASKS)

@@ -41,7 +41,7 @@ SKIPS = SkippedTicks(
         (17, 20, 3),
     ],
 )
-def test_skipped_ticks_are_those_that_one_task_has_missed_and_no_more_than_there_were(
+def test_skipped_ticks_are_counted_by_one_task_and_bounded(
     first: int, last: int, skipped: int
 ) -> None:
     assert SKIPS.between(first, last) == skipped
@@ -51,7 +51,7 @@ RESTART = event(105, "reaction", "restart", "lower")
 REJOINED = event(130, "recovery", "rejoined", "lower")
 
 
-def test_reactions_are_undone_by_their_own_recoveries() -> None:
+def test_each_reaction_is_undone_by_its_recovery() -> None:
     assert aftermath(KILL, [RESTART], 500, ()) == Aftermath(("restart",), False, None, ())
     other = replace(REJOINED, board="upper")
     early = replace(REJOINED, tick=104)

@@ -231,7 +231,7 @@ EXPLAINED = [
 
 
 @pytest.mark.parametrize(("struck", "events", "run", "unexplained"), EXPLAINED)
-def test_a_fault_explains_what_its_kind_leads_to_in_its_window_and_nothing_else(
+def test_a_fault_explains_only_consequences_of_its_kind_in_its_window(
     struck: Strike, events: list[Event], run: Circumstances, unexplained: list[int]
 ) -> None:
     found_out = verdict([struck], *events, run=run)
@@ -258,7 +258,7 @@ def test_a_fault_explains_what_its_kind_leads_to_in_its_window_and_nothing_else(
         ),
     ],
 )
-def test_a_reaction_that_a_kind_must_have_and_that_does_not_come_is_lacking(
+def test_a_required_reaction_that_does_not_follow_is_lacking(
     struck: Strike, events: list[Event], lacking: tuple[str, ...]
 ) -> None:
     assert judged(struck, *events).lacking == lacking
@@ -304,7 +304,7 @@ def test_a_death_that_the_rack_finds_late_is_late_whatever_its_neighbours_find(k
     assert judged(killed, stale).seen == "missed"
 
 
-def test_in_lockstep_a_death_is_bounded_in_ticks_for_the_wall_clock_means_nothing() -> None:
+def test_in_lockstep_a_death_is_bounded_in_ticks() -> None:
     died = Event(900 * TICK_NS, 99, "died", "lower", "died", "died")
     fault = judged(KILL, died, run=LOCKSTEP)
     # It strikes before its tick is given out: the Rack may see the tick before.
@@ -315,7 +315,7 @@ def test_in_lockstep_a_death_is_bounded_in_ticks_for_the_wall_clock_means_nothin
     assert (fault.delay, fault.bound, fault.is_within) == (90, None, True)
 
 
-def test_reactions_behind_the_next_fault_are_of_that_one() -> None:
+def test_reactions_after_the_next_fault_belong_to_that_fault() -> None:
     both = [NAN, strike("kill", "lower", 500, place=1)]
     events = replace(RESTART, tick=500), replace(REJOINED, tick=700)
     first, second = verdict(both, *events).faults
@@ -353,7 +353,7 @@ def test_misses_that_no_fault_explains_are_counted_apart_from_detections() -> No
     assert verdict([OVERRUN], replace(miss, tick=5000)).misses != ()
 
 
-def test_what_is_too_late_for_one_fault_and_in_time_for_the_next_is_of_the_next() -> None:
+def test_a_detection_too_late_for_one_fault_counts_for_the_next() -> None:
     stuck = strike("sensor-stuck", "lower", 100, 200, joint="elbow", count=90)
     noise = strike("sensor-noise", "lower", 300, 350, place=1, joint="elbow", size=1.0)
     first, second = verdict([stuck, noise], found(300, "sensor_model", "lower", "elbow")).faults

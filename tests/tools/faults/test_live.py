@@ -72,7 +72,7 @@ def test_a_fault_that_begins_at_the_next_tick_is_waited_for(rack: Running) -> No
 
 
 @pytest.mark.parametrize(("acted", "text"), [(1, "acted once"), (3, "acted 3 times")])
-def test_one_that_is_over_says_when_it_acted(rack: Running, acted: int, text: str) -> None:
+def test_a_fault_that_is_over_says_when_it_acted(rack: Running, acted: int, text: str) -> None:
     def serve() -> None:
         wait_until(lambda: rack.table.entries[0].stage == Stage.WAITING)
         rack.begin(0)
@@ -84,7 +84,7 @@ def test_one_that_is_over_says_when_it_acted(rack: Running, acted: int, text: st
     assert found["message"].endswith(f": ticks {TICK + 1} to {TICK + 8}, {text}")
 
 
-def test_one_with_a_tick_to_come_is_armed_and_can_be_withdrawn(rack: Running) -> None:
+def test_a_fault_with_a_future_tick_is_armed_and_can_be_withdrawn(rack: Running) -> None:
     found = rack.live.inject({"board": "lower", "kind": "kill", "tick": TICK + 1}, False)
     assert (found["stage"], found["waits_for"]) == (
         "waiting",
@@ -109,7 +109,7 @@ def test_one_with_a_tick_to_come_is_armed_and_can_be_withdrawn(rack: Running) ->
         rack.live.withdraw(0)
 
 
-def test_one_that_begins_while_it_is_withdrawn_stays(rack: Running) -> None:
+def test_a_fault_that_begins_while_it_is_withdrawn_stays(rack: Running) -> None:
     rack.live.inject({"board": "lower", "kind": "kill", "tick": TICK + 1}, False)
 
     def begin() -> None:
@@ -125,7 +125,7 @@ def test_one_that_begins_while_it_is_withdrawn_stays(rack: Running) -> None:
 
 
 @pytest.mark.timeout(20)
-def test_one_is_withdrawn_at_once_from_a_rack_that_is_held(
+def test_a_fault_is_withdrawn_at_once_from_a_held_rack(
     rack: Running, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(live, "BEGIN_S", 1000.0)
@@ -134,7 +134,7 @@ def test_one_is_withdrawn_at_once_from_a_rack_that_is_held(
     assert rack.live.withdraw(0)["stage"] == "free"
 
 
-def test_waits_have_an_end(rack: Running, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_wait_ends(rack: Running, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(live, "BEGIN_S", 0.02)
     with pytest.raises(Failure, match=r"the clock has not begun it within 0\.02 s"):
         rack.live.inject({"board": "lower", "kind": "kill"}, False)

@@ -41,7 +41,7 @@ def test_a_run_with_a_script_repeats_with_its_faults(
 
 SCRIPTS = {
     "noisy": "--faults = \"noisy\": no such file; did you mean 'noisy-bus'?",
-    "[[fault]]\nkind = 'kill'": "fault[0].board: missing; task to strike",
+    "[[fault]]\nkind = 'kill'": "fault[0].board: missing; affected task",
     "[[fault]]\nkind = 'kill'\nboard = 'servo'": (
         'fault[0].board = "servo": no such task; tasks: upper, lower'
     ),

@@ -26,13 +26,13 @@ def test_a_set_is_made_for_every_name_and_only_its_owner_may_read_it(tmp_path: P
     assert sorted(path.name for path in folder.iterdir()) == sorted(names)
     assert list(Credentials(folder, "cell").flaws(["10.0.0.1", "cell.local"])) == []
     assert list(Credentials(folder, "operator").flaws()) == []
-    assert "A set for tests" in done.stdout
-    assert "Each machine needs only authority.pem and its own pair" in done.stdout
+    assert "This set is for tests" in done.stdout
+    assert "Each machine needs only authority.pem and one pair" in done.stdout
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700
     assert {stat.S_IMODE(path.stat().st_mode) for path in folder.iterdir()} == {0o600}
 
 
-def test_it_is_valid_for_a_year_or_as_long_as_asked(tmp_path: Path) -> None:
+def test_a_set_is_valid_for_a_year_or_as_long_as_ordered(tmp_path: Path) -> None:
     for at, (days, options) in enumerate([(365, ()), (3, ("--days", 3))]):
         rack("lan", "certificates", tmp_path / str(at), "--for", "cell", *options)
         for name in ("cell.pem", "authority.pem"):
@@ -66,12 +66,10 @@ def test_nothing_is_overwritten(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", SHARED)
-def test_a_set_that_is_not_whole_or_whose_file_never_ends_is_not_added_to(
-    tmp_path: Path, name: str
-) -> None:
+def test_an_incomplete_or_endless_set_is_not_extended(tmp_path: Path, name: str) -> None:
     rack("lan", "certificates", tmp_path, "--for", "cell")
     (tmp_path / name).unlink()
-    lacking = "missing; see rack lan certificates --help"
+    lacking = "the file is missing; see rack lan certificates --help"
     for why in (lacking, "cannot be read: not a regular file, but a FIFO"):
         done = rack("lan", "certificates", tmp_path, "--for", "puma")
         assert (done.returncode, done.stderr) == (2, f"{tmp_path / name}: {why}\n")
@@ -90,17 +88,19 @@ def test_another_key_does_not_sign_for_the_authority(tmp_path: Path) -> None:
 
 
 BAD = {
-    **dict.fromkeys(("Cell", "", "../cell"), "permitted names"),
+    **dict.fromkeys(("Cell", "", "../cell"), "a name consists of"),
     **dict.fromkeys(("authority", "cell-key"), "a file of the set would have this name"),
     **dict.fromkeys(
         ("cell=", "cell=10.0.0.1,", "cell=300.0.0.1", "cell=*.local", "cell=10.0.0.1:7447"),
-        "permitted: NAME, or NAME=ADDRESS",
+        "it must be NAME or NAME=ADDRESS",
     ),
 }
 
 
 @pytest.mark.parametrize(("given", "why"), BAD.items())
-def test_a_name_or_address_that_cannot_be_is_one_line(tmp_path: Path, given: str, why: str) -> None:
+def test_an_invalid_name_or_address_is_reported_in_one_line(
+    tmp_path: Path, given: str, why: str
+) -> None:
     done = rack("lan", "certificates", tmp_path / "certs", "--for", given)
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.startswith(f'--for = "{given}": {why}')

@@ -119,7 +119,7 @@ def client(*words: str) -> Iterator[subprocess.Popen[str]]:
 
 @pytest.mark.slow
 @pytest.mark.alone
-def test_an_emergency_stop_is_set_from_afar_and_reset_at_the_rack(far: Far) -> None:
+def test_a_remote_emergency_stop_is_reset_at_the_rack(far: Far) -> None:
     segment = Segment.attach(far.name)
     (stopped,) = afar(f"estop {far.address} --json")
     assert (stopped.status, stopped.err) == (0, "")
@@ -136,7 +136,7 @@ def test_an_emergency_stop_is_set_from_afar_and_reset_at_the_rack(far: Far) -> N
 
 @pytest.mark.slow
 @pytest.mark.alone
-def test_nobody_stops_a_rack_who_may_not_or_has_no_key_to_press(far: Far) -> None:
+def test_nobody_can_stop_a_rack_without_a_right_or_a_terminal(far: Far) -> None:
     nobody = f"no rack '{far.name}' at {far.port}; racks there: none that knows 'nobody'; "
     where = "it waits to stop a rack of another machine, HOST/RACK"
     peer = f"{far.name}-peer"
@@ -149,8 +149,8 @@ def test_nobody_stops_a_rack_who_may_not_or_has_no_key_to_press(far: Far) -> Non
         f"estop {far.port}/other": (1, f"no rack 'other' at {far.port}; racks there: {far.name}"),
         f"estop {far.address} --as {peer}": (
             1,
-            f"rack '{far.name}' does not permit '{peer}' to stop it; its config:"
-            " adapter.lan.estop_from",
+            f"rack '{far.name}' does not permit '{peer}' to stop it;"
+            " name it in adapter.lan.estop_from of the rack's config",
         ),
         f"estop {far.address} --reset": (1, f"{reset}: rack estop {far.name} --reset"),
         f"estop {far.address} --ready": (1, "stdin has ended, and no stop was set"),
@@ -224,7 +224,7 @@ def test_a_stop_that_is_ready_waits_for_no_handshake_of_strangers(far: Far) -> N
 
 @pytest.mark.slow
 @pytest.mark.alone
-def test_whoever_is_ready_is_told_when_the_run_ends(far: Far) -> None:
+def test_a_ready_operator_is_told_when_the_run_ends(far: Far) -> None:
     with client("estop", far.address, "--ready") as ready:
         assert ready.stderr is not None
         assert ready.stderr.readline().startswith("ready to stop")
@@ -235,7 +235,7 @@ def test_whoever_is_ready_is_told_when_the_run_ends(far: Far) -> None:
 
 
 @pytest.mark.slow
-def test_a_host_that_cannot_be_reached_is_one_line(tmp_path: Path) -> None:
+def test_an_unreachable_host_is_reported_in_one_line(tmp_path: Path) -> None:
     port = free_port()
     make_credentials(tmp_path / "certs", {"cell": []}, 1)
     why = "not a rack; permitted: RACK, or HOST[:PORT]/RACK, as in 10.0.0.5/cell"
@@ -248,7 +248,9 @@ def test_a_host_that_cannot_be_reached_is_one_line(tmp_path: Path) -> None:
             "estop 127.0.0.1/x --as X!",
             f"estop 127.0.0.1:{open_port}/x --certificates {tmp_path}/certs --as stranger",
         )
-    missing = f"{tmp_path}/certs/stranger.pem: missing; see rack lan certificates --help"
+    missing = (
+        f"{tmp_path}/certs/stranger.pem: the file is missing; see rack lan certificates --help"
+    )
     assert [one.err.strip() for one in ended] == [
         f"127.0.0.1:{port}: cannot connect to port {port}: Connection refused",
         f'RACK = "127.0.0.1:99999/x": {why}',
@@ -258,10 +260,12 @@ def test_a_host_that_cannot_be_reached_is_one_line(tmp_path: Path) -> None:
     ]
 
 
-def test_another_machine_is_not_asked_without_certificates(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_request_is_sent_to_another_machine_without_certificates(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(socket.socket, "getpeername", lambda self: ("192.0.2.7", 7447))
     with (
         socket.create_server(("127.0.0.1", 0)) as server,
-        pytest.raises(Failure, match="not this machine, so it needs certificates"),
+        pytest.raises(Failure, match="is another machine, so a stop needs certificates"),
     ):
         check_reach(RackAddress("127.0.0.1", server.getsockname()[1], "cell"), Operator())

@@ -1,1 +1,1 @@
-"""Campaigns: faults of all kinds drawn at random, tried in trials, and summed up."""
+"""Campaigns: many trials with random faults of all kinds, and their evaluation."""

@@ -1,7 +1,8 @@
-"""The faultless rack in lockstep from which trials go on.
+"""Faultless lockstep run, from whose snapshots trials continue.
 
-Until its first fault a trial is this rack, bit for bit. So it goes on from the last snapshot before
-that, with the events until then, and its verdict is that of a whole trial.
+Until its first fault, a trial equals this run bit for bit. The trial therefore continues from the
+last snapshot before the fault, with the events up to it, and its verdict is the verdict on a whole
+trial.
 """
 
 from __future__ import annotations
@@ -18,17 +19,20 @@ from rack.boards.wiring import Continuation, SnapshotPolicy
 from rack.tools.faults.campaigns.plan import Plan
 
 EVERY_S = 2.0
-"""Simulated time between two snapshots: a trial goes through half of it, on the average, again."""
+"""Simulated time between two snapshots. On average a trial repeats half of it."""
 OF_LAUNCH = ("launch", "ready", "start")
-"""Kinds of events that each launch has anew."""
+"""Kinds of events that every launch has again."""
 
 
 @dataclass(frozen=True)
 class Start:
-    """Where a trial starts: before `tick`, with the `events` until then.
+    """Starting point of a trial.
 
-    `whole` says why it starts at its beginning; empty for one that does not, and for the faultless
-    run.
+    Attributes:
+        tick: Tick before which it starts.
+        whole: Why it starts at tick 0. Empty if it does not, and for the faultless run.
+        continues: The snapshot from which to continue. None for a whole run.
+        events: Events of the faultless run before the start.
     """
 
     tick: int = 0
@@ -37,16 +41,19 @@ class Start:
     events: tuple[Event, ...] = ()
 
     def at(self, tick: int) -> Start:
-        """Return the start at the snapshot that was found."""
+        """Return the start at the snapshot that was used, with the events before its tick."""
         if self.continues is None:
             return self
-        before = (e for e in self.events if e.tick < tick and e.kind not in OF_LAUNCH)
-        return Start(tick, "", self.continues, tuple(before))
+        earlier_events = (
+            event for event in self.events if event.tick < tick and event.kind not in OF_LAUNCH
+        )
+        return Start(tick, "", self.continues, tuple(earlier_events))
 
 
 class BaseRack:
-    """The faultless rack of one process that makes trials: its snapshots are in that process's
-    crate, and its trials have its `name`.
+    """The faultless rack of one worker process.
+
+    Its snapshots belong to that process's crate, and the process's trials use its name.
     """
 
     def __init__(self, config: RackConfig, name: str) -> None:
@@ -57,8 +64,12 @@ class BaseRack:
         self._why_none = config.outside
 
     def start_of(self, plan: Plan, crate: WarmCrate | None, seconds: float | None) -> Start:
-        """Return where the trial of a plan starts; run the base, for `seconds` where no task ends
-        it, if this crate has none.
+        """Return where the trial of a plan starts. Run the faultless rack first if necessary.
+
+        Args:
+            plan: Plan of the trial.
+            crate: Crate of the worker. None if it has none.
+            seconds: Simulated time of the faultless run if no task ends it, s.
         """
         if not (plan.faults or plan.kills):
             return Start()
@@ -70,16 +81,20 @@ class BaseRack:
             self._run(crate, seconds)
         if self._why_none:
             return Start(whole=f"{UNKEPT}{self._why_none}")
-        known = Continuation(plan.first, len(self._config.fault), len(self._config.command))
-        return Start(continues=known, events=tuple(self._events))
+        continuation = Continuation(plan.first, len(self._config.fault), len(self._config.command))
+        return Start(continues=continuation, events=tuple(self._events))
 
     def _run(self, crate: WarmCrate, seconds: float | None) -> None:
-        """Run the base in a crate, which keeps its snapshots."""
+        """Run the faultless rack in a crate, which keeps its snapshots."""
         config = Plan(0, "nominal", lockstep=True).config(self._config, self.name)
         every = max(1, round(EVERY_S * 1e9 / config.clock_ns))
         with Rack(config, crate=crate, snapshots=SnapshotPolicy(part=0, every=every)) as rack:
             rack.run(seconds)
         self._crate = crate
         self._events = rack.events
-        found = (e.text.removeprefix(UNKEPT) for e in rack.events if e.text.startswith(UNKEPT))
-        self._why_none = next(found, "")
+        reasons = (
+            event.text.removeprefix(UNKEPT)
+            for event in rack.events
+            if event.text.startswith(UNKEPT)
+        )
+        self._why_none = next(reasons, "")

@@ -1,5 +1,6 @@
-"""A campaign: a faultless run, trials with faults, kills and sizes, and faultless time; each run
-leaves a file.
+"""A campaign: a faultless run, trials with faults, kills and sizes, and faultless time.
+
+Each run leaves a file, so that a campaign can be continued.
 """
 
 from __future__ import annotations
@@ -27,28 +28,38 @@ from rack.tools.faults.campaigns.workers import TrialJob, Workers
 from rack.tools.faults.ending import EXTERNAL, record_of
 
 LAUNCH_S = 2.0
-"""About the time of a launch and an end, for the progress bar."""
+"""Approximate duration of a launch and an end, for the progress bar."""
 SHORTEST_S = 1.0
 """Shortest run of faultless time."""
 ROUNDS = 8
-"""Rounds in which faults that do not strike are drawn again, at other instants; then they are
-missing."""
+"""Number of rounds in which faults that did not act are drawn again before they are given up."""
 MOST_AGAIN = 4
-"""Draws of one fault in a round, at most: more from round to round, since the fewer are left, the
-less does one more cost."""
+"""Maximum number of draws for one missing fault in a round.
+
+The number grows from round to round: the fewer faults are missing, the less an extra draw costs.
+"""
 ORDER = "order.json"
 TRIALS = "trials"
-"""In a campaign's folder: the file with its order, and the folder of its trials."""
+"""Names of the file with the order, and of the folder of trials, in a campaign's folder."""
 NOMINAL = Plan(0, "nominal", lockstep=True)
 
 
 @dataclass(frozen=True)
 class Order:
-    """An order for a campaign. `injections` of each kind; `modes` are True for lockstep, in their
-    order.
+    """Order for a campaign.
 
-    `seconds`: simulated time of a rack that no task ends. `loads`: for each stretch of faultless
-    time, whether the machine is loaded.
+    Attributes:
+        name: Name of the config, for reports.
+        config: Config of the rack.
+        injections: Number of faults of each kind.
+        seed: Seed of all random choices.
+        modes: Clock modes in their order, True for lockstep.
+        kinds: Kinds, separated by commas. None for all.
+        kills: Number of kills from outside.
+        sizes: Number of sizes for each curve.
+        faultless_s: Simulated time without faults, s, for each load.
+        loads: Whether the machine is loaded, for each stretch of faultless time.
+        seconds: Simulated time of a rack that no task ends, s.
     """
 
     name: str
@@ -64,20 +75,29 @@ class Order:
     seconds: float | None = None
 
     def document(self) -> Document:
-        """Return the order as plain data: equal for campaigns that are the same."""
+        """Return the order as plain data. Equal campaigns have equal documents."""
         return {**vars(self), "config": self.config.text()}
 
 
 class Campaign:
-    """One campaign; with `whole`, no trial goes on from a snapshot. Raises `ConfigError`, and
-    `Failure` for a task that is not done even without faults.
+    """Runs one campaign.
+
+    Args:
+        order: What to do.
+        folder: Folder of the campaign.
+        progress: Progress display.
+        whole: Whether every trial runs from tick 0 instead of continuing from a snapshot.
+
+    Raises:
+        ConfigError: The config has mistakes.
+        Failure: The kinds of the order do not fit the rack.
     """
 
     def __init__(self, order: Order, folder: Path, progress: Progress, whole: bool = False) -> None:
         self.order = order
         self.folder = folder
         self._progress = progress
-        # Only the campaign's faults: the config's own would strike every trial. Misses are counted.
+        # Drop the config's faults, which would act in every trial. Misses are counted, not judged.
         unjudged = order.config.supervision.model_copy(update={"max_missed_fraction": 1.0})
         self._config = order.config.model_copy(update={"fault": (), "supervision": unjudged})
         self.layout: Layout = wire(self._config)
@@ -89,16 +109,20 @@ class Campaign:
         self._whole = whole
 
     def run(self) -> Results:
-        """Do everything that is not done yet, or as much as there is time for until Ctrl-C."""
+        """Do everything that is not done yet, until the end or until Ctrl-C.
+
+        Raises:
+            Failure: The task is not done even without faults, or another campaign uses the folder.
+        """
         order = self.order
         self._open()
         examine(self._config)
         with Workers(self._config, self._whole) as self._workers:
             self._progress.begin("without faults, in lockstep")
-            made = self._made([NOMINAL])
-            if not made:
+            nominal_runs = self._made([NOMINAL])
+            if not nominal_runs:
                 raise Failure(f"{order.name}: interrupted before the first run was done")
-            nominal = made[0]
+            nominal = nominal_runs[0]
             if nominal.shortfalls or nominal.ended != "task done":
                 why = "; ".join(nominal.shortfalls)
                 raise Failure(f"{order.name}: the task is not done even without faults: {why}")
@@ -118,57 +142,63 @@ class Campaign:
         return results
 
     def _open(self) -> None:
-        """Make the folder, or continue in it. Raises `Failure` where it is another campaign's."""
+        """Create the folder or continue in it. Raises `Failure` if another campaign uses it."""
         path = self.folder / ORDER
         wanted = json.loads(encode_json(self.order.document()))
         if path.exists():
-            there = json.loads(path.read_text())
-            if other := [key for key in wanted if wanted[key] != there.get(key)]:
-                differing = ", ".join(key.replace("_", " ") for key in other)
+            stored = json.loads(path.read_text())
+            if differing_keys := [key for key in wanted if wanted[key] != stored.get(key)]:
+                differing = ", ".join(key.replace("_", " ") for key in differing_keys)
                 raise Failure(
-                    f"--out {self.folder}: holds another campaign; it differs in {differing}", 2
+                    f"--out {self.folder} belongs to a campaign that differs in {differing}",
+                    2,
                 )
             return
         self.folder.mkdir(parents=True, exist_ok=True)
         write_json(path, wanted)
 
     def _under_test(self, lockstep: bool) -> RackUnderTest:
+        """Describe the rack for the draws of plans."""
         restart = self._config.supervision.restart_s(lockstep)
         return RackUnderTest(self._targets, self._ticks, self._second, restart)
 
     def _inject(self, results: Results, lockstep: bool) -> None:
-        """Make trials until every kind has struck as often as ordered."""
+        """Run trials until every kind has acted as often as ordered."""
         order = self.order
         kinds = self.kinds
         if lockstep or len(order.modes) > 1:
-            # Real time repeats nothing that lockstep can have.
+            # In real time, run only kinds that are impossible in lockstep.
             kinds = [kind for kind in kinds if needs_real_time(kind) != lockstep]
         # Unary plus leaves out the kinds that lack nothing.
         lacking = +Counter(dict.fromkeys(kinds, order.injections))
         rack = self._under_test(lockstep)
         tried = set[str]()
-        # Faults that have trials of their own come later: what is drawn again leaves cores free.
-        now = [kind for kind in lacking if record_of(kind).recoverable] or list(lacking)
+        # Faults that need a whole trial each come in later rounds, which leave cores free.
+        round_kinds = [kind for kind in lacking if record_of(kind).recoverable] or list(lacking)
         for turn in range(ROUNDS):
             seed = f"{order.seed} {turn}"
-            again = min(turn + 1, MOST_AGAIN)
-            counts = {kind: lacking[kind] * (again if kind in tried else 1) for kind in now}
-            found = self._made(fault_plans(rack, counts, seed, lockstep, self._number + 1))
-            results.trials += found
-            faults = [fault for run in found for fault in run.faults]
-            lacking -= Counter(f.kind for f in faults if f.is_judged and f.seen != "not struck")
+            draws = min(turn + 1, MOST_AGAIN)
+            counts = {kind: lacking[kind] * (draws if kind in tried else 1) for kind in round_kinds}
+            results_of_round = self._made(
+                fault_plans(rack, counts, seed, lockstep, self._number + 1)
+            )
+            results.trials += results_of_round
+            faults = [fault for run in results_of_round for fault in run.faults]
+            lacking -= Counter(
+                fault.kind for fault in faults if fault.is_judged and fault.seen != "not struck"
+            )
             if not lacking or INTERRUPT.number:
                 break
-            tried.update(now)
-            now = list(lacking)
+            tried.update(round_kinds)
+            round_kinds = list(lacking)
         wanted = order.injections
         results.lacking += [
-            f"{kind}: struck {wanted - count} of {wanted} times, in {ROUNDS} rounds"
+            f"{kind} acted only {wanted - count} of {wanted} times in {ROUNDS} rounds"
             for kind, count in lacking.items()
         ]
 
     def _made(self, plans: Sequence[Plan]) -> list[TrialResult]:
-        """Return the results of these plans, in their order: made now, or kept from before."""
+        """Return the results of these plans in their order, from new runs or from files."""
         self._number = max([self._number, *(plan.number for plan in plans)])
         if plans:
             self._progress.total(self._guess_s(plans))
@@ -180,62 +210,69 @@ class Campaign:
                 self._progress.begin(f"{len(waiting)} in {mode}")
             for job in self._workers.run(waiting, alone=not lockstep):
                 self._show(job)
-        return [found for job in jobs if (found := _kept(job))]
+        return [result for job in jobs if (result := _kept(job))]
 
     def _job(self, plan: Plan) -> TrialJob:
+        """Return the job that carries out a plan."""
         name = f"{plan.number:04}" if plan.number else plan.purpose
         path = self.folder / TRIALS / f"{name}.json"
         return TrialJob(plan, path, self._ticks, self.order.seconds)
 
     def _show(self, job: TrialJob) -> None:
-        """Show how a trial ended; where it falls short, leave a plan that repeats it."""
+        """Show how a trial ended. If it has shortfalls, write a plan that repeats it."""
         plan = job.plan
-        if (found := _kept(job)) is None:
+        if (result := _kept(job)) is None:
             return
-        if found.shortfalls and plan.number:
+        if result.shortfalls and plan.number:
             path = self.folder / f"trial-{plan.number:04}.toml"
             path.write_text(plan.toml(self.order.name))
-        ended = f"{_text(plan)}: {found.ended}"
-        self._progress.end(self._guess_s([plan]), ended, found.shortfalls)
+        text = f"{_text(plan)}: {result.ended}"
+        self._progress.end(self._guess_s([plan]), text, result.shortfalls)
 
     def _run_faultless(self, results: Results) -> None:
-        """Run without faults, alone or under load, for as long as ordered."""
+        """Run without faults for as long as ordered, without load and under load."""
         if not self.order.faultless_s:
             return
-        for place, is_loaded in enumerate(self.order.loads):
+        for stretch, is_loaded in enumerate(self.order.loads):
             if INTERRUPT.number:
                 return
             burden = load() if is_loaded else nullcontext("")
-            with burden as under:
-                runs = tuple(self._calm(place, under))
+            with burden as load_text:
+                runs = tuple(self._calm(stretch, load_text))
             seconds = sum(run.ticks for run in runs) / self._second
-            results.faultless.append(Faultless(under, seconds, runs))
+            results.faultless.append(Faultless(load_text, seconds, runs))
 
-    def _calm(self, place: int, under: str) -> Iterator[TrialResult]:
-        """Yield faultless runs in real time."""
+    def _calm(self, stretch: int, load_text: str) -> Iterator[TrialResult]:
+        """Yield the results of faultless runs in real time.
+
+        Args:
+            stretch: Index of the stretch of faultless time.
+            load_text: Description of the load. Empty without load.
+        """
         faultless = self._job(Plan(0, "faultless", lockstep=False))
-        name = f"faultless under {under}" if under else "faultless"
-        left = self.order.faultless_s
-        nth = 0
-        while left >= SHORTEST_S and not INTERRUPT.number:
-            self._progress.begin(f"{name}, {left:.0f} s left")
-            seconds = left if left < self._ticks / self._second else self.order.seconds
-            path = faultless.path.with_stem(f"faultless-{place}-{nth:03}")
+        name = f"faultless under {load_text}" if load_text else "faultless"
+        left_s = self.order.faultless_s
+        run_number = 0
+        while left_s >= SHORTEST_S and not INTERRUPT.number:
+            self._progress.begin(f"{name}, {left_s:.0f} s left")
+            seconds = left_s if left_s < self._ticks / self._second else self.order.seconds
+            path = faultless.path.with_stem(f"faultless-{stretch}-{run_number:03}")
             job = replace(faultless, path=path, seconds=seconds)
             if _kept(job) is None:
                 list(self._workers.run([job], alone=True))
-            if (found := _kept(job)) is None:
+            if (result := _kept(job)) is None:
                 return
-            yield found
-            # A run that has not ended would not end the next time either.
-            ran_s = found.ticks / self._second or left
-            left -= ran_s
-            nth += 1
-            self._progress.end(ran_s, found.ended, found.shortfalls)
+            yield result
+            # A run without ticks has not ended, and would not end if it were repeated.
+            ran_s = result.ticks / self._second or left_s
+            left_s -= ran_s
+            run_number += 1
+            self._progress.end(ran_s, result.ended, result.shortfalls)
 
     def _guess_s(self, plans: Sequence[Plan]) -> float:
-        """Estimate the time that runs take: in lockstep a core simulates the default rack in a
-        third of real time.
+        """Estimate the duration of runs, s.
+
+        In lockstep a core simulates the default rack in about a third of real time.
         """
         real_s = self._ticks / self._second
         lockstep_s = real_s / 3.0 / len(os.sched_getaffinity(0))
@@ -244,15 +281,16 @@ class Campaign:
 
 
 def _kept(job: TrialJob) -> TrialResult | None:
-    """Return the result that is kept of a trial; None for one of another plan, drawn by another
-    version.
+    """Return the saved result of a trial. None if it is missing or belongs to another plan.
+
+    Another version may draw another plan for the same trial number.
     """
-    found = kept(job.path)
-    return found if found is not None and found.plan == job.plan else None
+    result = kept(job.path)
+    return result if result is not None and result.plan == job.plan else None
 
 
 def _text(plan: Plan) -> str:
-    """Return a plan in a few words."""
+    """Describe a plan in a few words."""
     if not plan.number:
         return plan.purpose
     kinds = Counter([*(table["kind"] for table in plan.faults), *[EXTERNAL] * len(plan.kills)])

@@ -1,4 +1,4 @@
-"""The end of a trial as soon as the verdict on each of its faults is certain."""
+"""Early end of a trial, as soon as the verdict on each of its faults is certain."""
 
 from __future__ import annotations
 
@@ -13,10 +13,12 @@ from rack.tools.faults.judge import Circumstances, Judge, Judgement, end_of
 
 
 class Certainty:
-    """Ends a trial in lockstep as soon as nothing that follows can change the verdict on a fault.
+    """Ends a lockstep trial as soon as no later event can change the verdict on any fault.
 
-    It holds the rack before the ticks at which that may be so. `is_reached`: it has ended the
-    trial.
+    It holds the rack before the ticks at which that may be the case.
+
+    Attributes:
+        is_reached: Whether it has ended the trial.
     """
 
     def __init__(self, rack: Rack, joints: Sequence[str], run: Circumstances) -> None:
@@ -28,14 +30,14 @@ class Certainty:
         self._hold(max(0, rack.begins_at))
 
     def look(self) -> None:
-        """Judge, if the rack is held; then let it go on, or end."""
+        """If the rack is held, judge its faults, then let it continue or end it."""
         tick = self._words[System.HELD] - 1
         if tick < 0 or self.is_reached:
             return
         struck = strikes(self._rack.segment, self._joints)
         certain_at = certain_from(struck, self._rack.events, self._run, tick)
         if certain_at is None:
-            # It runs to its end.
+            # The verdict needs the whole run, so hold it no more.
             self._words[System.HOLD_AT] = 0
         elif certain_at > tick:
             self._hold(certain_at)
@@ -45,43 +47,55 @@ class Certainty:
             self._words[System.HOLD_AT] = 0
 
     def _hold(self, tick: int) -> None:
+        """Let the rack hold before a tick."""
         self._words[System.HOLD_AT] = tick + 1
 
 
 def certain_from(
     strikes: Sequence[Strike], events: Sequence[Event], run: Circumstances, tick: int
 ) -> int | None:
-    """Return the tick from which nothing that happens later can change the judgement of a run's
-    faults, as far as is known before `tick`; a later one at which to ask again; None: its end.
+    """Return the tick from which no later event can change the judgement of a run's faults.
+
+    Args:
+        strikes: Faults of the run so far.
+        events: Events of the run so far.
+        run: Facts about the run.
+        tick: Tick before which the rack is held.
+
+    Returns:
+        A tick up to `tick` if the judgement is certain, a later tick at which to ask again, or None
+        if the judgement needs the whole run.
     """
-    now = Event(0, tick, "end", "", "")
-    return _ForesightedJudge(strikes, [*events, now], run).certain_from(tick)
+    end_event = Event(0, tick, "end", "", "")
+    return _ForesightedJudge(strikes, [*events, end_event], run).certain_from(tick)
 
 
 class _ForesightedJudge(Judge):
+    """Judge that also computes when its judgements become final."""
+
     def certain_from(self, tick: int) -> int | None:
-        """Return the tick as `certain_from` does, asked before `tick`."""
+        """Return the tick from which all judgements are final: see the function of this name."""
         latest = tick
-        for strike, found in zip(self._strikes, self.verdict().faults, strict=True):
-            closes = self._closes(strike, found, tick)
-            if closes is None:
+        for strike, judgement in zip(self._strikes, self.verdict().faults, strict=True):
+            certain_tick = self._closes(strike, judgement, tick)
+            if certain_tick is None:
                 return None
-            latest = max(latest, closes)
+            latest = max(latest, certain_tick)
         return latest
 
-    def _closes(self, strike: Strike, found: Judgement, tick: int) -> int | None:
-        """Return the tick from which the judgement of a fault is certain, as in `certain_from`."""
-        again = tick + self._settle
+    def _closes(self, strike: Strike, judgement: Judgement, tick: int) -> int | None:
+        """Return the tick from which one judgement is final: see `find_certain_tick`."""
+        retry_tick = tick + self._settle
         if strike.began < 0:
-            return again
+            return retry_tick
         if strike.ends >= NEVER:
             return None
         ends = end_of(strike)
         if strike.tick < 0 and ends >= tick:
-            return again
-        closes = self._last_trace(strike, ends) + 1
-        if closes > tick:
-            return closes
-        # Its writer may find the fault of a plan at any later time, or have something to write.
-        is_open = self._window(strike)[1] >= tick and found.seen != "detected"
-        return again if is_open or not found.is_recovered else tick
+            return retry_tick
+        certain_tick = self._last_trace(strike, ends) + 1
+        if certain_tick > tick:
+            return certain_tick
+        # A planner may notice a fault of its plans, or write its next message, at any later time.
+        is_open = self._window(strike)[1] >= tick and judgement.seen != "detected"
+        return retry_tick if is_open or not judgement.is_recovered else tick

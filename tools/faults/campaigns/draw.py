@@ -1,6 +1,4 @@
-"""Random plans: which faults strike a trial, where, and when. The same seed draws the same
-plans.
-"""
+"""Random plans: which faults act in a trial, where and when. Equal seeds draw equal plans."""
 
 from __future__ import annotations
 
@@ -17,38 +15,48 @@ from rack.tools.faults.campaigns.plan import Kill, Plan, Purpose, Target, Target
 from rack.tools.faults.ending import EXTERNAL, record_of
 
 MOST_FAULTS = 40
-"""Faults of one trial, at most: the fault table holds a few more."""
+"""Maximum number of faults in a trial. The fault table has room for a few more."""
 LEAD_S = 0.1
-"""Simulated time before the first fault, at least."""
+"""Minimum simulated time before the first fault."""
 TAIL_S = 1.0
-"""Simulated time at the end of a faultless run in which no fault begins: it must strike a task
-under way."""
+"""Simulated time at the end of a faultless run in which no fault begins.
+
+A fault must act while the task is being executed.
+"""
 SETTLE_S = 0.1
-"""Simulated time between the end of all that a fault may lead to and the next fault."""
+"""Simulated time between the last possible effect of a fault and the next fault."""
 EPISODE = 25
-"""Reads after which a reader reports the next fault of a mailbox again: those of `Episodes`, and
-some more."""
+"""Number of reads after which a reader reports another fault of the same mailbox, with a margin.
+
+See `Episodes` for the number itself.
+"""
 MORE_S = 0.25
-"""Simulated time by which a window grows, at most, so that its mailbox may be struck again."""
+"""Maximum simulated time by which a window is extended so that its mailbox may be used again."""
 HOLDS_UP_S = 0.5
-"""Simulated time by which the task ends later for each fault that stops the arm: 0.5 to 1.6 s for
-NASREM's. What comes after its end does not strike, and is drawn again."""
+"""Simulated time by which each fault that stops the arm prolongs the task, s.
+
+For NASREM it is 0.5 to 1.6 s. Faults after the end of the task do not act and are drawn again.
+"""
 SHUFFLES = 20
-"""Orders that are tried for the faults of a trial."""
+"""Number of random orders that are tried for the faults of a trial."""
 BATCH = 1000
-"""Faults that are shared out between trials at a time."""
+"""Number of faults that are distributed over trials at a time."""
 KILL_GAP_S = 3.5
-"""Simulated time between two kills from outside, at least: a restart takes up to two seconds of
-real time."""
+"""Minimum simulated time between two kills from outside. A restart takes up to 2 s of real time."""
 LEAST_TICKS = 20
-"""Least time, in ticks, in which a fault that strikes no mailbox is found and over."""
+"""Minimum time in ticks that a fault without a mailbox needs to be detected and to end."""
 SEEDS = 2**31
 
 
 @dataclass(frozen=True)
 class RackUnderTest:
-    """The rack that plans are drawn for: its targets, ticks of a faultless run and of a second,
-    time of a restart.
+    """The rack for which plans are drawn.
+
+    Attributes:
+        targets: Possible targets of faults.
+        ticks: Length of a faultless run, ticks.
+        second: Number of ticks in a simulated second.
+        restart_s: Simulated time that a restart may take, s.
     """
 
     targets: Targets
@@ -58,17 +66,26 @@ class RackUnderTest:
 
     @property
     def first(self) -> int:
-        """The first tick at which a fault may begin."""
+        """First tick at which a fault may begin."""
         return round(LEAD_S * self.second)
 
     @property
     def room(self) -> int:
-        """The ticks from there in which faults may begin, and their consequences last."""
+        """Number of ticks in which faults may begin and have their consequences."""
         return max(1, self.ticks - round(TAIL_S * self.second) - self.first)
 
     def window(self, target: Target, ticks: int, parameters: Mapping[str, float]) -> int:
-        """Return the ticks from the beginning of a fault to the next: it is found, over, and
-        recovered from.
+        """Return the time from the beginning of a fault to the next fault.
+
+        In this time the fault is detected, ends and is recovered from.
+
+        Args:
+            target: Target of the fault.
+            ticks: Duration of the fault, ticks.
+            parameters: Values of its parameters. Others have their defaults.
+
+        Returns:
+            The time in ticks.
         """
         layout = self.targets.layout
         kind = target.record
@@ -78,21 +95,28 @@ class RackUnderTest:
         box = boxes.index(target.mailbox) if target.mailbox else -1
         values = tuple(parameters.get(p.name, p.default or 0.0) for p in kind.parameters)
         entry = Injection(kind.number, task, box, parameters=values)
-        lasts = kind.bound_ticks(entry, layout) or 0
+        duration = kind.bound_ticks(entry, layout) or 0
         if not kind.is_over_when_found:
-            least = 2 * target.cycle + target.reader if target.mailbox else LEAST_TICKS
-            lasts = max(lasts, ticks, least)
+            min_duration = 2 * target.cycle + target.reader if target.mailbox else LEAST_TICKS
+            duration = max(duration, ticks, min_duration)
         recovery = kind.recovery_ticks(target.board, layout, self.restart_s)
-        return lasts + recovery + round(SETTLE_S * self.second)
+        return duration + recovery + round(SETTLE_S * self.second)
 
 
 @dataclass(frozen=True)
 class Card:
-    """One fault that waits for its place in a trial.
+    """One fault that is to be assigned to a trial.
 
-    `ticks`: its length, 0 for a kind that strikes once. `may_repeat`: its mailbox may be struck
-    again in the same trial, since after its window readers tell of the next fault, too. `room`: the
-    ticks of a faultless run that it takes, without those by which it makes the task end later.
+    Attributes:
+        target: Target of the fault.
+        ticks: Duration in ticks. 0 for a kind that acts once.
+        parameters: Values of its parameters.
+        window: Ticks from its beginning to the next fault.
+        room: Ticks of a faultless run that it needs, without those by which it prolongs the task.
+        may_repeat: Whether another fault of the same trial may affect its mailbox, because readers
+            report that fault too.
+        seed: Seed of the fault.
+        phase: Fraction of the first tick that passes before it acts.
     """
 
     target: Target
@@ -106,8 +130,13 @@ class Card:
 
     @classmethod
     def draw(cls, rack: RackUnderTest, kind: str, rng: Random, size: float | None = None) -> Card:
-        """Draw a fault as the kind's record says; with a `size`, of a single joint, as a point of a
-        curve.
+        """Draw a fault as the record of its kind describes.
+
+        Args:
+            rack: The rack.
+            kind: Name of the kind.
+            rng: Random generator.
+            size: Size of the fault, for a point of a curve. The fault then affects a single joint.
         """
         target = rng.choice(rack.targets.by_kind[kind])
         record = target.record
@@ -120,27 +149,35 @@ class Card:
                 parameters["joint"] = rng.randrange(joints)
             parameters["size"] = size
         window = rack.window(target, ticks, parameters)
-        told = 0
+        reported_ticks = 0
         if target.mailbox is not None:
-            held = parameters.get("by", 0) * target.cycle if record.where == "writer" else 0
-            told = ticks + round(held) + EPISODE * max(target.reader, target.cycle)
-        if window < told <= window + MORE_S * rack.second:
-            window = told
+            delay_ticks = parameters.get("by", 0) * target.cycle if record.where == "writer" else 0
+            reported_ticks = ticks + round(delay_ticks) + EPISODE * max(target.reader, target.cycle)
+        if window < reported_ticks <= window + MORE_S * rack.second:
+            window = reported_ticks
         is_stop = parameters.get("size", 0.0) >= (record.visible_from or 0.0)
-        holds_up = round(HOLDS_UP_S * rack.second) if record.where == "arm" and is_stop else 0
+        prolonged_ticks = (
+            round(HOLDS_UP_S * rack.second) if record.where == "arm" and is_stop else 0
+        )
         return cls(
             target=target,
             ticks=ticks,
             parameters=parameters,
             window=window,
-            room=window - holds_up,
-            may_repeat=window >= told,
+            room=window - prolonged_ticks,
+            may_repeat=window >= reported_ticks,
             seed=rng.randrange(SEEDS),
             phase=_phase(rng),
         )
 
     def table(self, rack: RackUnderTest, tick: int, lockstep: bool) -> Document:
-        """Return the fault as a `[[fault]]` table that begins at `tick`."""
+        """Return the fault as a `[[fault]]` table.
+
+        Args:
+            rack: The rack.
+            tick: Tick at which the fault begins.
+            lockstep: Whether the trial is in lockstep, where faults have no phase.
+        """
         target = self.target
         kind = target.record
         table: Document = {"kind": kind.name, "board": target.board}
@@ -158,9 +195,16 @@ class Card:
 def fault_plans(
     rack: RackUnderTest, counts: Mapping[str, int], seed: str, lockstep: bool, first: int
 ) -> list[Plan]:
-    """Return plans, numbered from `first`, that have each of these kinds so many times.
+    """Draw plans that contain a number of faults of each kind.
 
-    Faults come in random order, as many in a trial as fit into the task, one after the other.
+    The faults come in random order, as many in a trial as fit into the task one after the other.
+
+    Args:
+        rack: The rack.
+        counts: Number of faults of each kind.
+        seed: Seed of the draws.
+        lockstep: Whether the trials are in lockstep.
+        first: Number of the first trial.
     """
     mode = "lockstep" if lockstep else "realtime"
     rng = Random(f"{seed} {mode}")
@@ -173,17 +217,23 @@ def fault_plans(
 def kill_plans(
     rack: RackUnderTest, count: int, seed: int, modes: Sequence[bool], first: int
 ) -> list[Plan]:
-    """Return plans of kills from outside, `count` in all, in these modes by turns, numbered from
-    `first`.
+    """Draw plans of kills from outside.
+
+    Args:
+        rack: The rack.
+        count: Number of kills.
+        seed: Seed of the draws.
+        modes: Clock modes, True for lockstep, which the trials use in turn.
+        first: Number of the first trial.
     """
     rng = Random(f"{seed} kills")
     targets = rack.targets.by_kind[EXTERNAL]
-    gap = KILL_GAP_S * rack.second
-    a_run = max(1, int(rack.room / gap))
+    gap_ticks = KILL_GAP_S * rack.second
+    kills_per_run = max(1, int(rack.room / gap_ticks))
     plans = list[Plan]()
-    for done in range(0, count, a_run):
-        boards = [rng.choice(targets).board for _ in range(min(a_run, count - done))]
-        starts = _starts(rack, [round(gap)] * len(boards), rng)
+    for done in range(0, count, kills_per_run):
+        boards = [rng.choice(targets).board for _ in range(min(kills_per_run, count - done))]
+        starts = _starts(rack, [round(gap_ticks)] * len(boards), rng)
         kills = [Kill(b, tick, _phase(rng)) for b, tick in zip(boards, starts, strict=True)]
         lockstep = modes[len(plans) % len(modes)]
         plans.append(Plan(first + len(plans), "kills", lockstep, kills=tuple(kills)))
@@ -193,8 +243,14 @@ def kill_plans(
 def size_plans(
     rack: RackUnderTest, kinds: Sequence[str], count: int, seed: int, first: int
 ) -> list[Plan]:
-    """Return plans in lockstep with `count` sizes of every kind that must be found from a certain
-    size.
+    """Draw lockstep plans for the curves of size against detection delay.
+
+    Args:
+        rack: The rack.
+        kinds: Names of kinds. Kinds that are always detectable are left out.
+        count: Number of sizes of each kind.
+        seed: Seed of the draws.
+        first: Number of the first trial.
     """
     rng = Random(f"{seed} sizes")
     sizes = [(kind, size) for kind in kinds for size in swept_sizes(kind, count)]
@@ -204,7 +260,7 @@ def size_plans(
 
 
 def swept_sizes(kind: str, count: int) -> list[float]:
-    """Return sizes for the curve of size against delay; none for a kind that is always visible."""
+    """Return the sizes for a kind's curve. Empty for a kind that is always detectable."""
     record = record_of(kind)
     if record.visible_from is None or record.size is None:
         return []
@@ -212,15 +268,21 @@ def swept_sizes(kind: str, count: int) -> list[float]:
 
 
 class Share:
-    """The faults that one trial is given. `room`: ticks that are left for more."""
+    """The faults that are assigned to one trial.
+
+    Attributes:
+        cards: The faults.
+        room: Ticks that are left for more faults.
+    """
 
     def __init__(self, room: int) -> None:
         self.cards: list[Card] = []
         self.room = room
-        self._struck: dict[str, bool] = {}  # mailboxes, and whether others may follow
+        # By affected mailbox, whether another fault of it may follow.
+        self._struck: dict[str, bool] = {}
 
     def takes(self, card: Card) -> bool:
-        """Say whether a fault fits in; the first one always does."""
+        """Return True if a fault fits into the trial. The first one always does."""
         box = card.target.mailbox
         if box in self._struck and not (self._struck[box] and card.may_repeat):
             return False
@@ -228,7 +290,7 @@ class Share:
         return fits or not self.cards
 
     def add(self, card: Card) -> None:
-        """Take a fault in."""
+        """Assign a fault to the trial."""
         self.cards.append(card)
         self.room -= card.room
         if card.target.mailbox is not None:
@@ -243,21 +305,21 @@ def _packed(
     cards: Sequence[Card],
     rng: Random,
 ) -> list[Plan]:
-    """Return plans with all of these faults, in as few trials as they fit into."""
+    """Return plans with all of these faults, in as few trials as possible."""
     shared = [card for card in cards if card.target.record.recoverable]
     trials = [
         share.cards
-        for at in range(0, len(shared), BATCH)
-        for share in _shared_out(rack.room, shared[at : at + BATCH])
+        for first_card in range(0, len(shared), BATCH)
+        for share in _shared_out(rack.room, shared[first_card : first_card + BATCH])
     ]
     trials += [[card] for card in cards if not card.target.record.recoverable]
     plans = list[Plan]()
-    for chosen in trials:
-        chosen = _ordered(rack.room, chosen, rng)
-        starts = _starts(rack, [card.window for card in chosen], rng)
+    for trial_cards in trials:
+        trial_cards = _ordered(rack.room, trial_cards, rng)
+        starts = _starts(rack, [card.window for card in trial_cards], rng)
         faults = list[Document]()
         kills = list[Kill]()
-        for card, start in zip(chosen, starts, strict=True):
+        for card, start in zip(trial_cards, starts, strict=True):
             if card.target.kind == EXTERNAL:
                 kills.append(Kill(card.target.board, start, card.phase))
             else:
@@ -266,40 +328,46 @@ def _packed(
     return plans
 
 
-def _shared_out(room: int, cards: Sequence[Card]) -> list[Share]:
-    """Share faults out between trials: the longest first, each where least room is left."""
+def _shared_out(room_ticks: int, cards: Sequence[Card]) -> list[Share]:
+    """Distribute faults over trials: the longest first, each where least room is left."""
     shares: list[Share] = []
     for card in sorted(cards, key=lambda card: -card.window):
         fitting = [share for share in shares if share.takes(card)]
         if not fitting:
-            fitting = [Share(room)]
+            fitting = [Share(room_ticks)]
             shares += fitting
         min(fitting, key=lambda share: share.room).add(card)
     return shares
 
 
-def _ordered(room: int, cards: Sequence[Card], rng: Random) -> list[Card]:
-    """Return faults in the best of some random orders: if possible each begins before the end of a
-    task that those before it have prolonged, and those of the arm late: at first it is at rest.
+def _ordered(room_ticks: int, cards: Sequence[Card], rng: Random) -> list[Card]:
+    """Return faults in the best of some random orders.
+
+    If possible, each begins before the end of a task that earlier faults have prolonged. Faults of
+    the arm come late, because the arm is at rest at first.
     """
     orders = [rng.sample(cards, len(cards)) for _ in range(SHUFFLES)]
 
-    def quality(order: list[Card]) -> tuple[bool, int]:
+    def rate_order(order: list[Card]) -> tuple[bool, int]:
+        """Rate an order: whether all faults fit, and how late the first fault of the arm comes."""
         needed = max(accumulate(card.room for card in order))
-        before = takewhile(lambda card: card.target.record.where != "arm", order)
-        return needed <= room, sum(card.window for card in before)
+        cards_before = takewhile(lambda card: card.target.record.where != "arm", order)
+        return needed <= room_ticks, sum(card.window for card in cards_before)
 
-    return max(orders, key=quality)
+    return max(orders, key=rate_order)
 
 
 def _starts(rack: RackUnderTest, windows: Sequence[int], rng: Random) -> list[int]:
-    """Return a tick for each window, one after the other from a random tick on: a trial goes on
-    from the snapshot before its first fault.
+    """Return a start tick for each window, one after the other from a random tick on.
+
+    The first tick is late if there is room, because a trial continues from the last snapshot before
+    its first fault.
     """
-    free = max(rack.first, rack.room - sum(windows))
-    earliest = accumulate(windows, initial=rack.first + rng.randint(0, free))
+    spare_ticks = max(rack.first, rack.room - sum(windows))
+    earliest = accumulate(windows, initial=rack.first + rng.randint(0, spare_ticks))
     return list(earliest)[:-1]
 
 
 def _phase(rng: Random) -> float:
+    """Draw the fraction of a tick that passes before a fault acts."""
     return rng.randrange(PHASES) / PHASES

@@ -1,6 +1,4 @@
-"""The surroundings of trials: a load on the machine, leftovers of racks, and a check of the
-violation counter.
-"""
+"""Surroundings of trials: load, leftovers of racks, and a check of the violation counter."""
 
 from __future__ import annotations
 
@@ -21,7 +19,7 @@ from rack.tools.console.interrupt import await_ends, descendants
 BOUND_S = 2.0
 """Time that killed processes get to end."""
 COMM_LENGTH = 15
-"""Characters that the kernel keeps of a process's name."""
+"""Number of characters of a process's name that the kernel keeps."""
 FACTOR = 2.0
 """Velocity that the violation counter must count, as a multiple of the limit."""
 BUSY = ("sh", "-c", "while :; do :; done")
@@ -29,17 +27,21 @@ WRITING = ("sh", "-c", "while :; do sync; done")
 
 
 def children() -> set[int]:
-    """Return the living processes that descend from this one."""
-    found = {pid for pid in descendants(os.getpid()) if is_alive(pid)}
-    # The snapshots of a crate that serves several racks end with that.
-    return {pid for pid in found if not _name(pid).startswith(COPY)}
+    """Return the living descendants of this process."""
+    living = {pid for pid in descendants(os.getpid()) if is_alive(pid)}
+    # Snapshots end with their crate, which may serve several racks.
+    return {pid for pid in living if not _name(pid).startswith(COPY)}
 
 
 def left_behind(rack: str, before: set[int]) -> list[str]:
-    """Return everything left of a rack, segments and semaphores by name, processes by pid, each as
-    one readable text.
+    """Return everything that is left of a rack, as readable texts.
 
-    `before`: descendants of this process that were there before the rack.
+    Args:
+        rack: Name of the rack.
+        before: Descendants of this process that existed before the rack.
+
+    Returns:
+        The paths of segments and semaphores, and the processes.
     """
     await_ends({*_named(rack), *(children() - before)}, BOUND_S)
     processes = _named(rack) | (children() - before)
@@ -48,25 +50,28 @@ def left_behind(rack: str, before: set[int]) -> list[str]:
 
 
 def _named(rack: str) -> set[int]:
-    """Return the processes with names of a rack's boards, whatever their parent is."""
+    """Return the processes that are named like a rack's boards, whatever their parent."""
     start = f"{rack}:"[:COMM_LENGTH]
     pids = (int(path.name) for path in Path("/proc").glob("[0-9]*"))
     return {pid for pid in pids if _name(pid).startswith(start) and is_alive(pid)}
 
 
 def _name(pid: int) -> str:
+    """Return the name of a process. Empty if it does not exist."""
     with suppress(FileNotFoundError, ProcessLookupError):
         return Path(f"/proc/{pid}/comm").read_text().rstrip("\n")
     return ""
 
 
 def examine(config: RackConfig) -> None:
-    """Check the violation counter: move every joint at twice its limit for one tick.
+    """Check the violation counter by moving every joint at twice its limit for one tick.
 
-    A campaign that says "no limit violated" must be able to see a violation. Raises `Failure` where
-    it is not counted.
+    A campaign that reports "no limit violated" must be able to see a violation.
+
+    Raises:
+        Failure: A violation is not counted.
     """
-    # Only here: the workers, which make the trials, need none of them.
+    # Imported late, because the workers that make the trials need none of these modules.
     from numpy import isfinite
 
     from rack.levels.arm import SimulatedArm
@@ -92,23 +97,23 @@ def examine(config: RackConfig) -> None:
             name = config.robot.joints[joint]
             speed = f"{FACTOR * limit:g} rad/s"
             raise Failure(
-                f"violation counter: joint '{name}' at {speed}, twice its limit, is not counted"
+                f"the violation counter does not count joint '{name}' at {speed}, twice its limit"
             )
 
 
 @contextmanager
 def load() -> Iterator[str]:
-    """Keep every core that this process may use busy, and the disks; yields the load in words.
+    """Keep all cores that this process may use, and the disks, busy. Yields a description.
 
-    Uses `stress-ng` where it is installed.
+    Uses `stress-ng` if it is installed.
     """
     cores = os.sched_getaffinity(0)
-    words = f"{len(cores)} busy processes and one that writes"
+    description = f"{len(cores)} busy processes and one that writes"
     commands: list[tuple[Sequence[str], set[int]]]
     commands = [*((BUSY, {core}) for core in cores), (WRITING, cores)]
     if shutil.which("stress-ng") is not None:
-        words = f"stress-ng --cpu {len(cores)} --io 1"
-        commands = [(words.split(), cores)]
+        description = f"stress-ng --cpu {len(cores)} --io 1"
+        commands = [(description.split(), cores)]
     with ExitStack() as stack:
         for command, its_cores in commands:
             process = subprocess.Popen(
@@ -118,12 +123,12 @@ def load() -> Iterator[str]:
                 preexec_fn=partial(_begin, os.getpid(), its_cores),
             )
             stack.callback(process.wait)
-            # Terminated, not killed: stress-ng then ends its own processes.
+            # Terminate it instead of killing it, so that stress-ng can end its processes.
             stack.callback(process.terminate)
-        yield words
+        yield description
 
 
 def _begin(parent: int, cores: set[int]) -> None:
-    """Begin as a process of the load, on these cores, which ends with its parent."""
+    """Prepare a process of the load, which runs on these cores and ends with its parent."""
     die_with_parent(parent)
     os.sched_setaffinity(0, cores)

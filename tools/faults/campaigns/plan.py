@@ -1,4 +1,4 @@
-"""The plan of a trial, and the targets in a rack that a plan can choose from."""
+"""Plan of a trial, and the targets in a rack among which plans choose."""
 
 from __future__ import annotations
 
@@ -24,8 +24,12 @@ Purpose = Literal["faults", "kills", "sizes", "nominal", "faultless"]
 
 @dataclass(frozen=True)
 class Kill:
-    """One SIGKILL from outside, of the process of `board`. `phase` is the part of the tick that has
-    passed.
+    """One SIGKILL from outside.
+
+    Attributes:
+        board: Board whose process is killed.
+        tick: Tick of the kill.
+        phase: Fraction of the tick that passes before it.
     """
 
     board: str
@@ -35,8 +39,16 @@ class Kill:
 
 @dataclass(frozen=True)
 class Plan:
-    """One trial. `faults` are tables as in a config; `rack run CONFIG --faults FILE` repeats a
-    plan.
+    """Faults and mode of one trial.
+
+    The command `rack run CONFIG --faults FILE` repeats a plan that was written to a file.
+
+    Attributes:
+        number: Number of the trial. 0 for a run without faults.
+        purpose: Purpose of the run.
+        lockstep: Whether it runs in lockstep.
+        faults: Tables of faults as in a config.
+        kills: Kills from outside.
     """
 
     number: int
@@ -47,20 +59,20 @@ class Plan:
 
     @property
     def name(self) -> str:
-        """The trial by its number; a run without one by its purpose."""
+        """Name of the trial by its number, or of a run without a number by its purpose."""
         return f"trial {self.number}" if self.number else f"{self.purpose} run"
 
     @property
     def first(self) -> int:
-        """The tick at which the first fault begins; 0 for one that prevents the launch."""
+        """Tick at which the first fault begins. 0 for a fault that prevents the launch."""
         ticks = [table.get("tick", 0) for table in self.faults] + [kill.tick for kill in self.kills]
         return min(ticks, default=0)
 
     def config(self, config: RackConfig, rack: str) -> RackConfig:
-        """Return the config that runs this plan, as a rack of another name."""
+        """Return the config that carries out this plan, with another name for the rack."""
         clock: dict[str, Any] = {"mode": "realtime"}
         if self.lockstep:
-            # Only real time has a speed.
+            # A speed has no meaning in lockstep.
             clock = {"mode": "lockstep", "speed": 1.0}
         faults = tuple(FaultConfig.model_validate(table) for table in self.faults)
         return config.model_copy(
@@ -72,8 +84,9 @@ class Plan:
         )
 
     def toml(self, config: str) -> str:
-        """Return the faults as a file for `--faults`; kills from outside, which no file can hold,
-        as comments.
+        """Return the faults as a file for `--faults`.
+
+        Kills from outside cannot be expressed in such a file, so they are written as comments.
         """
         mode = " --lockstep" if self.lockstep else ""
         faults = to_toml({"fault": [dict(table) for table in self.faults]})
@@ -86,16 +99,24 @@ class Plan:
 
 
 def needs_real_time(kind: str) -> bool:
-    """Return whether a kind does not exist in lockstep, or means nothing there: no time passes
-    while a process dies.
+    """Return True if faults of a kind are not useful in lockstep.
+
+    Either the kind does not exist in lockstep, or its delay has no meaning because no simulated
+    time passes while a process dies.
     """
     return kind == EXTERNAL or KINDS[kind].realtime
 
 
 @dataclass(frozen=True)
 class Target:
-    """A place for a fault. `cycle`: the period of the task, or of a mailbox's messages, ticks;
-    `reader`: that of its fastest reader.
+    """A place at which a fault of a kind may act.
+
+    Attributes:
+        kind: Name of the kind.
+        board: Affected task.
+        cycle: Period of the task, or of the mailbox's messages, ticks.
+        mailbox: Affected mailbox. None for a fault of the whole task.
+        reader: Period of the mailbox's fastest reader, ticks.
     """
 
     kind: str
@@ -106,13 +127,17 @@ class Target:
 
     @property
     def record(self) -> Kind:
-        """The kind's record."""
+        """Record of the kind."""
         return record_of(self.kind)
 
 
 class Targets:
-    """The places in one rack where a fault of each kind can strike and be seen. `joints` is the
-    number of the arm's.
+    """The places in one rack at which a fault of each kind can act and be detected.
+
+    Attributes:
+        layout: Layout of the rack.
+        joints: Number of joints of the arm.
+        by_kind: Targets of each kind.
     """
 
     def __init__(self, config: RackConfig, layout: Layout) -> None:
@@ -121,24 +146,27 @@ class Targets:
         self._roles = {task.name: task.role for task in layout.tasks}
         self._driving = {name: kind.faults for name, kind in executors(config).items()}
         self.by_kind = {kind.name: self._of(kind) for kind in KINDS}
-        # The clock's process can be killed like any other.
+        # The clock's process can be killed from outside as well.
         self.by_kind[EXTERNAL] = self._at(EXTERNAL, [*self._roles, CLOCK])
 
     def _of(self, kind: Kind) -> list[Target]:
+        """Return the targets of a kind."""
         if not kind.takes_mailbox:
             return self._at(kind.name, self._tasks(kind))
         targets = []
         for box in filter(partial(self._is_seen, kind), self.layout.mailboxes):
-            # The servo level writes a scene in one of its cycles out of many.
+            # The servo level writes a scene only in every n-th cycle.
             cycle = max(cycle_ticks(self.layout, box.writer), box.every)
             reader = min(between_reads(self.layout, box, reader) for reader in box.readers)
             targets.append(Target(kind.name, box.writer, cycle, box.name, reader))
         return targets
 
     def _at(self, kind: str, tasks: Iterable[str]) -> list[Target]:
+        """Return a target for each of these tasks."""
         return [Target(kind, task, cycle_ticks(self.layout, task)) for task in tasks]
 
     def _tasks(self, kind: Kind) -> list[str]:
+        """Return the tasks that a kind may affect as a whole."""
         if kind.where == "clock":
             return [CLOCK]
         if kind.where == "arm":
@@ -146,42 +174,51 @@ class Targets:
         return [task for task, role in self._roles.items() if role in kind.tasks]
 
     def _is_seen(self, kind: Kind, box: MailboxSpec) -> bool:
-        """Return whether the mailbox has readers, and messages often enough: plans are not
-        periodic.
+        """Return True if a fault of a mailbox can be detected.
+
+        The mailbox needs readers, and messages often enough: plans, for example, are not periodic.
         """
-        # The clock writes only for an operator, and a host board when its program says so.
+        # The clock writes only for an operator, and a host board at the will of its program.
         role = self._roles.get(box.writer)
         if role is None or not box.readers:
             return False
         if kind.where == "lock" and box.protocol != "lock":
             return False
-        # A queue is written on demand, and the position of its reader through no port.
+        # A queue is written on demand, and its reader's position is not written through a port.
         if kind.where == "writer" and (box.protocol == "queue" or is_position(box)):
             return False
         return role in kind.tasks and (kind.where != "writer" or role == "executor")
 
 
 def kinds_for(wanted: str | None, targets: Targets, realtime: bool) -> list[str]:
-    """Return the kinds of a campaign, `wanted` as in "kill,mute"; None: all that the rack can have.
+    """Return the kinds of a campaign.
 
-    Raises `Failure` for an unknown kind, or one that the rack cannot have.
+    Args:
+        wanted: Names of kinds, separated by commas. None for all that the rack can have.
+        targets: Targets in the rack.
+        realtime: Whether the campaign includes real time.
+
+    Raises:
+        Failure: A kind is unknown, or the rack cannot have it.
     """
-    known = {kind.name: kind.realtime for kind in KINDS} | {EXTERNAL: False}
-    permitted = [
-        name for name, needs in known.items() if (realtime or not needs) and targets.by_kind[name]
+    needs_real_time_by_kind = {kind.name: kind.realtime for kind in KINDS} | {EXTERNAL: False}
+    possible = [
+        name
+        for name, needs in needs_real_time_by_kind.items()
+        if (realtime or not needs) and targets.by_kind[name]
     ]
     if wanted is None:
-        return permitted
+        return possible
     named = dict.fromkeys(name.strip() for name in wanted.split(",") if name.strip())
-    kinds = f"kinds: {', '.join(permitted)}"
+    valid_text = f"valid kinds: {', '.join(possible)}"
     for name in named:
-        if name not in known:
-            raise Failure(f"--kinds {name}: no such kind; {kinds}", 2)
-        if known[name] and not realtime:
+        if name not in needs_real_time_by_kind:
+            raise Failure(f"--kinds {name}: there is no such kind; {valid_text}", 2)
+        if needs_real_time_by_kind[name] and not realtime:
             why = f"{name} needs real time, and the campaign is in lockstep"
-            raise Failure(f"--kinds {name}: {why}; {kinds}", 2)
-        if name not in permitted:
-            raise Failure(f"--kinds {name}: nothing in this rack can have it; {kinds}", 2)
+            raise Failure(f"--kinds {name}: {why}; {valid_text}", 2)
+        if name not in possible:
+            raise Failure(f"--kinds {name}: nothing in this rack can have it; {valid_text}", 2)
     if not named:
-        raise Failure(f"--kinds: names no kind; {kinds}", 2)
+        raise Failure(f"--kinds names no kind; {valid_text}", 2)
     return list(named)

@@ -1,4 +1,4 @@
-"""A campaign as a picture, campaign.png. Imports matplotlib: see `rack.tools.console.pictures`."""
+"""A campaign as a chart, campaign.png. Imports matplotlib: see `rack.tools.console.pictures`."""
 
 from __future__ import annotations
 
@@ -23,25 +23,24 @@ SIZE_IN = (13.0, 8.0)
 DOT = "#4477aa"
 MIDDLE = "#222222"
 BOUND = "#cc3311"
-"""Colours that people with any kind of colour vision can distinguish (Paul Tol's)."""
+"""Colours that are distinguishable with any kind of colour vision (Paul Tol)."""
 WIDEST = 1.5
-"""Part of a bound up to which delays are drawn; later ones are arrows at the edge."""
+"""Fraction of a bound up to which delays are drawn. Later ones are arrows at the edge."""
 
 
 def plot(report: CampaignReport, path: Path) -> None:
     """Draw a campaign into a PNG file: delays against bounds, curves of size, recovery times."""
     order = report.order
     with picture([path], *SIZE_IN) as figure:
-        for place, draw in zip(_places(figure), (_delays, _sizes, _recoveries), strict=True):
-            draw(figure.add_subplot(place), report)
+        for position, draw in zip(_places(figure), (_delays, _sizes, _recoveries), strict=True):
+            draw(figure.add_subplot(position), report)
         title = f"Faults injected into {order.name}: {report.trials}, seed {order.seed}"
         figure.suptitle(title, fontsize=11)
 
 
 def _places(figure: Figure) -> Iterator[SubplotSpec]:
-    """Yield the places of the three drawings: one on the left, two on the right."""
-    # Fixed: the numbers next to the left one and the names of kinds need their room whatever is
-    # drawn.
+    """Yield the places of the three charts: one on the left, two on the right."""
+    # Fixed margins: the numbers beside the left chart and the names of kinds always need room.
     grid = figure.add_gridspec(
         2,
         2,
@@ -57,18 +56,21 @@ def _places(figure: Figure) -> Iterator[SubplotSpec]:
 
 
 def _delays(axes: Axes, report: CampaignReport) -> None:
-    """Draw each fault's time to detection as a part of its own bound; note median and longest in
-    cycles.
+    """Draw the detection delay of each fault as a fraction of its bound.
+
+    The median and the maximum of each kind are written beside it, in cycles.
     """
     kinds = list(report.by_kind)[::-1]
     for row, kind in enumerate(kinds):
-        found = [fault for fault in report.faults_of(kind) if fault.seen == "detected"]
-        parts = [part for part in map(_part, found) if part is not None]
-        _row(axes, row, [part for part in parts if part <= WIDEST])
-        late = sum(part > WIDEST for part in parts)
-        axes.scatter([WIDEST] * late, [row] * late, marker=">", s=40, color=BOUND, clip_on=False)
-        if parts:
-            axes.scatter([min(WIDEST, median(parts))], [row], marker="|", s=180, color=MIDDLE)
+        detected = [fault for fault in report.faults_of(kind) if fault.seen == "detected"]
+        fractions = [fraction for fraction in map(_part, detected) if fraction is not None]
+        _row(axes, row, [fraction for fraction in fractions if fraction <= WIDEST])
+        late_count = sum(fraction > WIDEST for fraction in fractions)
+        axes.scatter(
+            [WIDEST] * late_count, [row] * late_count, marker=">", s=40, color=BOUND, clip_on=False
+        )
+        if fractions:
+            axes.scatter([min(WIDEST, median(fractions))], [row], marker="|", s=180, color=MIDDLE)
         figures = report.by_kind[kind]
         numbers = f"{figures.detected} of {figures.injected}"
         if figures.cycles is not None:
@@ -83,19 +85,22 @@ def _delays(axes: Axes, report: CampaignReport) -> None:
 
 
 def _row(axes: Axes, row: int, values: list[float]) -> None:
+    """Draw values as dots in a row."""
     axes.scatter(
         values, [row] * len(values), s=26, color=DOT, alpha=0.4, linewidths=0, clip_on=False
     )
 
 
 def _name_rows(axes: Axes, names: list[str]) -> None:
+    """Write names beside the rows."""
     axes.set_yticks(range(len(names)), names, fontsize=8)
     axes.set_ylim(-0.7, max(0, len(names) - 1) + 0.7)
 
 
 def _part(fault: Judgement) -> float | None:
-    """Return a fault's delay as a part of its bound; a bound of the same cycle is met exactly or
-    not at all.
+    """Return the delay of a fault as a fraction of its bound.
+
+    A bound of 0, the same cycle, is either met exactly or exceeded.
     """
     if fault.bound == 0 and fault.bound_ms is None:
         return 0.0 if fault.delay == 0 else 2 * WIDEST
@@ -103,33 +108,35 @@ def _part(fault: Judgement) -> float | None:
 
 
 def _sizes(axes: Axes, report: CampaignReport) -> None:
-    """Draw the size of a sensor's error against the time to its detection."""
+    """Draw the size of sensor errors against the delay of their detection."""
     edge = axes.get_xaxis_transform()
     longest = 10 * report.clock_ms
-    for (kind, found), marker in zip(report.curves.items(), "os", strict=False):
-        sizes = [point.size for point in found.curve if point.delay_ms is not None]
-        delays = [point.delay_ms for point in found.curve if point.delay_ms is not None]
-        unseen = [point.size for point in found.curve if point.delay_ms is None]
+    for (kind, size_curve), marker in zip(report.curves.items(), "os", strict=False):
+        sizes = [point.size for point in size_curve.curve if point.delay_ms is not None]
+        delays = [point.delay_ms for point in size_curve.curve if point.delay_ms is not None]
+        unseen = [point.size for point in size_curve.curve if point.delay_ms is None]
         longest = max([longest, *delays])
         (line,) = axes.plot(sizes, delays, marker, markersize=5, alpha=0.6, label=kind)
         color = line.get_color()
         axes.plot(unseen, [1.0] * len(unseen), "x", color=color, transform=edge, clip_on=False)
-        axes.axvline(found.judged_from, color=color, linewidth=0.9, linestyle=":")
+        axes.axvline(size_curve.judged_from, color=color, linewidth=0.9, linestyle=":")
     if report.curves:
         axes.set_xscale("log")
         axes.xaxis.set_minor_formatter(NullFormatter())
-        # Linear up to a tick: most delays are 0.
+        # Use a linear scale up to one tick, because most delays are 0.
         axes.set_yscale("symlog", linthresh=report.clock_ms)
         axes.set_ylim(-0.5 * report.clock_ms, 1.5 * longest)
         axes.legend(fontsize=8)
     else:
         axes.text(0.5, 0.5, "no size was tried", ha="center", transform=axes.transAxes)
-    axes.set_xlabel("size of the error, rad (dotted: must be found from there; x: not found)")
+    axes.set_xlabel(
+        "size of the error, rad (dotted: smallest that must be detected; x: not detected)"
+    )
     axes.set_ylabel("time to detection, ms")
 
 
 def _recoveries(axes: Axes, report: CampaignReport) -> None:
-    """Draw the time from each strike until every reaction was undone."""
+    """Draw the time from each fault until every reaction was undone."""
     kinds: list[str] = []
     for kind in reversed(report.by_kind):
         ticks = [fault.recovery for fault in report.faults_of(kind) if fault.recovery is not None]

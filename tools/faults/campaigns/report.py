@@ -1,6 +1,4 @@
-"""The report of a campaign: one document, campaign.json, and campaign.md for people, from the same
-figures.
-"""
+"""Report of a campaign: campaign.json, and campaign.md with the same figures for people."""
 
 from __future__ import annotations
 
@@ -29,7 +27,7 @@ from rack.tools.faults.campaigns.statistics import (
 from rack.tools.faults.judge import Judgement
 
 SHOWN = 30
-"""Shortfalls that the text shows; campaign.json has them all."""
+"""Maximum number of shortfalls in campaign.md. campaign.json contains all of them."""
 KINDS_HEAD = [
     "kind",
     "injected",
@@ -50,8 +48,25 @@ KINDS_HEAD = [
 
 @dataclass(frozen=True)
 class CampaignSummary(FaultCounts):
-    """The figures of all kinds together; `false_trips` are unexplained detections in faultless
-    time, `verdicts_certain` trials that ended as soon as the verdict on each fault was certain.
+    """Figures of all kinds together.
+
+    Attributes:
+        trials: Number of trials.
+        tasks_done: Trials whose task was done.
+        verdicts_certain: Trials that were ended once the verdict on each fault was certain.
+        safely_stopped: Trials that ended with the arm at rest and no limit violated.
+        not_armed: Trials whose launch was refused because of a fault.
+        neither: All other trials.
+        limits_violated: Number of violated limits, checked at every substep.
+        touches: Number of unintended contacts.
+        left_behind: Number of processes and segments that were left behind.
+        simulated_s: Simulated time of all runs, s.
+        unexplained: Detections that no fault explains.
+        unexplained_per_hour: Their rate in simulated time.
+        stray_misses: Deadline misses that no fault explains, in real time.
+        false_trips: Unexplained detections in faultless time.
+        faultless_s: Simulated time without faults, s.
+        false_trips_per_hour: Rate of false trips.
     """
 
     trials: int
@@ -73,8 +88,17 @@ class CampaignSummary(FaultCounts):
 
 
 class CampaignReport:
-    """The figures of a campaign; `shortfalls`, the reasons why it fails, are empty when it
-    passes.
+    """Figures of a campaign.
+
+    Attributes:
+        order: Order of the campaign.
+        results: Results of all runs.
+        clock_ms: Length of a tick, ms.
+        summary: Figures of all kinds together.
+        by_kind: Figures of each kind.
+        curves: Curve of size against delay, by kind.
+        shortfalls: Reasons why the campaign fails. Empty if it passes.
+        modes: Clock modes, as text.
     """
 
     def __init__(self, campaign: Campaign, results: Results, wall_s: float) -> None:
@@ -90,7 +114,7 @@ class CampaignReport:
         self.clock_ms = clock_ns * 1e-6
         self.summary = _summary(results, 1e9 / clock_ns)
         self.by_kind = by_kind(results.faults, clock_ns)
-        self.curves = {kind: found for kind, found in curves.items() if found.curve}
+        self.curves = {kind: curve for kind, curve in curves.items() if curve.curve}
         self.shortfalls = _shortfalls(results)
         self.modes = ["lockstep" if mode else "realtime" for mode in campaign.order.modes]
         self._kinds = campaign.kinds
@@ -98,15 +122,15 @@ class CampaignReport:
 
     @property
     def trials(self) -> str:
-        """The number of trials, and their modes, in words."""
+        """Number of trials and their modes, as text."""
         return f"{self.summary.trials} trials, {' and '.join(self.modes)}"
 
     def faults_of(self, kind: str) -> list[Judgement]:
-        """Return the judgements of a kind, in all trials."""
+        """Return the judgements of a kind in all trials."""
         return [fault for fault in self.results.faults if fault.kind == kind]
 
     def document(self) -> Document:
-        """Return all results as plain data."""
+        """Return the content of campaign.json."""
         run = self.results.nominal
         return {
             "config": self.order.name,
@@ -132,8 +156,8 @@ class CampaignReport:
                 kind: {**asdict(figures), **self._trials_with(kind)}
                 for kind, figures in self.by_kind.items()
             },
-            "sizes": {kind: asdict(found) for kind, found in self.curves.items()},
-            "faultless": [part.document() for part in self.results.faultless],
+            "sizes": {kind: asdict(size_curve) for kind, size_curve in self.curves.items()},
+            "faultless": [stretch.document() for stretch in self.results.faultless],
             "faults": [
                 {"trial": run.plan.number, "lockstep": run.plan.lockstep, **asdict(fault)}
                 for run in self.results.trials
@@ -144,27 +168,29 @@ class CampaignReport:
         }
 
     def _notes(self) -> list[str]:
-        # Trials in lockstep share a core each, and note it.
+        # Leave out lockstep, where every launch notes that all boards share one core.
+        """Return the notes of launches in real time, each once."""
         runs = [run for run in self.results.runs if not run.plan.lockstep]
         return list(dict.fromkeys(note for run in runs for note in run.notes))
 
     def _trials_with(self, kind: str) -> dict[str, int]:
-        """Return the number of trials in which a kind struck, and of those whose task was done."""
-        ended = [
+        """Count the trials in which a kind acted, and how many of them completed their task."""
+        ends = [
             run.ended
             for run in self.results.trials
             if any(fault.kind == kind and fault.struck >= 0 for fault in run.faults)
         ]
-        return {"trials": len(ended), "tasks_done": ended.count("task done")}
+        return {"trials": len(ends), "tasks_done": ends.count("task done")}
 
     def markdown(self) -> str:
-        """Return campaign.md."""
+        """Return the content of campaign.md."""
         return "\n".join(self._lines()) + "\n"
 
     def _lines(self) -> Iterator[str]:
+        """Yield the lines of campaign.md."""
         verdict = "fell short" if self.shortfalls else "passed"
         cores = len(os.sched_getaffinity(0))
-        interrupted = " Interrupted: results until then." if self.results.is_interrupted else ""
+        interrupted = " The campaign was interrupted." if self.results.is_interrupted else ""
         yield f"# Campaign on {self.order.name}, seed {self.order.seed}: {verdict}"
         yield ""
         yield (
@@ -180,12 +206,12 @@ class CampaignReport:
             yield from markdown_table(KINDS_HEAD, rows)
             yield ""
             yield (
-                "At least: the smallest lower bound of Wilson's 95 % interval of detected, in bound"
-                " and recovered."
+                "'At least' is the smallest lower bound of Wilson's 95 % intervals for the shares"
+                " detected, in bound and recovered."
             )
         yield from self._faultless()
-        for kind, found in self.curves.items():
-            yield from _sizes(kind, found)
+        for kind, size_curve in self.curves.items():
+            yield from _sizes(kind, size_curve)
         if self.shortfalls:
             yield from ("", f"## Shortfalls: {len(self.shortfalls)}", "")
             yield from (f"- {line}" for line in self.shortfalls[:SHOWN])
@@ -193,27 +219,27 @@ class CampaignReport:
     def _rows(self) -> Iterator[tuple[str, Any]]:
         """Yield the rows of the summary."""
         summary = self.summary
-        again = f"{summary.not_struck} more did not strike and were drawn again"
-        yield "injected", f"{summary.injected}; {again}"
+        redrawn = f"{summary.not_struck} more did not strike and were drawn again"
+        yield "injected", f"{summary.injected}; {redrawn}"
         yield "detected", summary.detected
         yield "within the bound", summary.within_bound
         yield "reacted to", summary.reacted_to
         recovered = str(summary.recovered)
         if summary.latched:
-            recovered += f", of which {summary.latched} ended the task, as permitted"
+            recovered += f", including {summary.latched} that ended the task, as permitted"
         yield "recovered from", recovered
-        ended = self.results.ended
-        ends = [f"{ended[name]} {name}" for name in get_args(Ended) if ended[name]]
+        end_counts = self.results.ended
+        ends = [f"{end_counts[name]} {name}" for name in get_args(Ended) if end_counts[name]]
         yield "trials ended", ", ".join(ends) or "none"
-        begun = [run for run in self.results.trials if run.start]
-        skipped_s = sum(run.start for run in begun) * self.clock_ms * 1e-3
-        spared = f"{len(begun)} trials, {skipped_s:.0f} simulated s of the faultless run"
-        yield "continued from a snapshot", spared
+        continued = [run for run in self.results.trials if run.start]
+        skipped_s = sum(run.start for run in continued) * self.clock_ms * 1e-3
+        saved = f"{len(continued)} trials, {skipped_s:.0f} simulated s of the faultless run"
+        yield "continued from a snapshot", saved
         yield "limits violated", f"{summary.limits_violated} (in any substep of any run)"
         yield "touches", summary.touches
         yield "left behind", f"{summary.left_behind} (processes, segments)"
-        found = f"{summary.unexplained} in {summary.simulated_s / 3600.0:.2f} simulated hours"
-        yield "false detections", f"{found}: {_rate(summary.unexplained_per_hour)}"
+        unexplained = f"{summary.unexplained} in {summary.simulated_s / 3600.0:.2f} simulated hours"
+        yield "false detections", f"{unexplained}: {_rate(summary.unexplained_per_hour)}"
         if summary.faultless_s:
             trips = f"{summary.false_trips} in {summary.faultless_s:g} s"
             trips_per_hour = _rate(summary.false_trips_per_hour)
@@ -221,11 +247,12 @@ class CampaignReport:
         yield "unexplained misses in real time", summary.stray_misses
 
     def _faultless(self) -> Iterator[str]:
+        """Yield the lines about faultless time."""
         rows = []
-        for part in self.results.faultless:
-            load = f"under {part.load}" if part.load else "alone"
-            misses = [f"{count} {name.replace('_', ' ')}" for name, count in part.misses.items()]
-            row = [load, f"{part.seconds:.0f}", str(part.trips), _rate(part.rate)]
+        for stretch in self.results.faultless:
+            load = f"under {stretch.load}" if stretch.load else "alone"
+            misses = [f"{count} {name.replace('_', ' ')}" for name, count in stretch.misses.items()]
+            row = [load, f"{stretch.seconds:.0f}", str(stretch.trips), _rate(stretch.rate)]
             rows.append([*row, ", ".join(misses) or "none"])
         if rows:
             yield from ("", "## Faultless, in real time", "")
@@ -234,21 +261,22 @@ class CampaignReport:
 
 
 def _summary(results: Results, second: float) -> CampaignSummary:
+    """Compute the figures of all kinds together. `second` is the number of ticks in a second."""
     trials = results.trials
     runs = results.runs
-    ended = results.ended
-    calm_s = sum(part.seconds for part in results.faultless)
-    trips = sum(part.trips for part in results.faultless)
+    end_counts = results.ended
+    faultless_s = sum(stretch.seconds for stretch in results.faultless)
+    trips = sum(stretch.trips for stretch in results.faultless)
     simulated_s = sum(run.ticks for run in runs) / second
     unexplained = sum(len(run.unexplained) for run in runs)
     return CampaignSummary(
         **vars(totals(results.faults)),
         trials=len(trials),
-        tasks_done=ended["task done"],
-        verdicts_certain=ended["verdicts certain"],
-        safely_stopped=ended["safely stopped"],
-        not_armed=ended["not armed"],
-        neither=ended["neither"],
+        tasks_done=end_counts["task done"],
+        verdicts_certain=end_counts["verdicts certain"],
+        safely_stopped=end_counts["safely stopped"],
+        not_armed=end_counts["not armed"],
+        neither=end_counts["neither"],
         limits_violated=sum(run.violations for run in runs),
         touches=sum(run.touches for run in runs),
         left_behind=sum(len(run.left) for run in runs),
@@ -257,17 +285,19 @@ def _summary(results: Results, second: float) -> CampaignSummary:
         unexplained_per_hour=rate(unexplained, simulated_s),
         stray_misses=sum(run.stray_misses for run in trials if not run.plan.lockstep),
         false_trips=trips,
-        faultless_s=round(calm_s, 1),
-        false_trips_per_hour=rate(trips, calm_s),
+        faultless_s=round(faultless_s, 1),
+        false_trips_per_hour=rate(trips, faultless_s),
     )
 
 
 def _shortfalls(results: Results) -> list[str]:
+    """Return the shortfalls of all runs."""
     lines = [f"{run.plan.name}: {line}" for run in results.runs for line in run.shortfalls]
     return lines + results.lacking
 
 
 def _trial(run: TrialResult) -> Document:
+    """Return the entry of a trial in campaign.json."""
     return {
         "number": run.plan.number,
         "purpose": run.plan.purpose,
@@ -281,13 +311,15 @@ def _trial(run: TrialResult) -> Document:
     }
 
 
-def _rate(found: EventRate | None) -> str:
-    if found is None:
+def _rate(event_rate: EventRate | None) -> str:
+    """Format a rate with its confidence bound."""
+    if event_rate is None:
         return "-"
-    return f"{found.an_hour:.3g} an hour, below {found.below:.3g} with 95 % confidence"
+    return f"{event_rate.an_hour:.3g} an hour, below {event_rate.below:.3g} with 95 % confidence"
 
 
 def _kind_row(kind: str, figures: KindFigures) -> list[str]:
+    """Return the row of a kind in the table of kinds."""
     counts = (figures.injected, figures.detected, figures.within_bound, figures.recovered)
     lowest = [share[0] for share in figures.wilson.values() if share is not None]
     worst = f"{min(lowest):.1%}" if lowest else "-"
@@ -305,16 +337,21 @@ def _kind_row(kind: str, figures: KindFigures) -> list[str]:
 
 
 def _median_max(values: Spread | None) -> tuple[str, str]:
+    """Format median and maximum."""
     return ("-", "-") if values is None else (f"{values.median:.4g}", f"{values.max:.4g}")
 
 
-def _sizes(kind: str, found: SizeCurve) -> Iterator[str]:
+def _sizes(kind: str, curve_of_sizes: SizeCurve) -> Iterator[str]:
+    """Yield the lines about a curve of size against delay."""
     size = KINDS[kind].size
     unit = size.unit if size is not None else ""
     yield from ("", f"## {kind}: size against delay", "")
-    yield from (f"Must be found from {found.judged_from:g} {unit}.", "")
+    yield from (
+        f"Errors must be detected from a size of {curve_of_sizes.judged_from:g} {unit}.",
+        "",
+    )
     rows = []
-    for point in found.curve:
+    for point in curve_of_sizes.curve:
         after_ms = "-" if point.delay_ms is None else f"{point.delay_ms:g}"
         rows.append([f"{point.size:.4g}", point.joint or "all", after_ms])
     yield from markdown_table([f"size, {unit}", "joint", "found after, ms"], rows)

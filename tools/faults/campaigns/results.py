@@ -1,4 +1,4 @@
-"""The results of a campaign: trials as judged, each kept in a file, and faultless time."""
+"""Results of a campaign: judged trials, each saved in a file, and faultless time."""
 
 from __future__ import annotations
 
@@ -24,13 +24,26 @@ Ended = Literal["task done", "verdicts certain", "safely stopped", "not armed", 
 
 @dataclass(frozen=True)
 class TrialResult:
-    """The part of a trial that is kept, for the report of its campaign.
+    """The part of a trial that is saved for the report of its campaign.
 
-    `ended`: how the task ended; safely: with the arm at rest and no limit violated; or that the
-    trial was ended before, since the verdict on each fault was certain. `misses`: their
-    number by code; `stray_misses`: those that no fault explains. `unexplained`: false detections.
-    `shortfalls`: a line each; none in a good trial. `start`: the tick of the snapshot from which
-    it was run, or 0, and then `whole` says why.
+    Attributes:
+        plan: Plan of the trial.
+        ended: How the trial ended: with the task done, early because all verdicts were certain,
+            safely stopped (arm at rest, no limit violated), not armed, or otherwise.
+        ticks: Length of the run, ticks.
+        digest: Digest of the run.
+        violations: Number of violated limits.
+        touches: Number of unintended contacts.
+        left: Everything that the rack left behind.
+        wall_s: Duration in real time, s.
+        notes: Notes of the launch.
+        misses: Number of deadline misses, by code.
+        stray_misses: Number of misses that no fault explains.
+        faults: Judgements of its faults.
+        unexplained: Detections that no fault explains.
+        shortfalls: What was wrong, a line each. Empty for a good trial.
+        start: Tick of the snapshot from which the trial continued. 0 if it did not.
+        whole: Why it did not continue from a snapshot.
     """
 
     plan: Plan
@@ -78,9 +91,7 @@ def result_of(trial: Trial) -> TrialResult:
 
 
 def keep(trial: Trial, path: Path) -> None:
-    """Judge a trial, and write it with all that happened in it to a file, which exists whole or not
-    at all.
-    """
+    """Judge a trial and save it with all its events. The file is written atomically."""
     outcome = asdict(trial.outcome) if trial.outcome else None
     document = {
         "finding": asdict(result_of(trial)),
@@ -97,7 +108,7 @@ _KEPT = TypeAdapter(TrialResult)
 
 
 def kept(path: Path) -> TrialResult | None:
-    """Return the result that a file keeps; None where there is no file."""
+    """Load the result in a file, or return None if the file does not exist."""
     try:
         return _KEPT.validate_python(json.loads(path.read_text())["finding"])
     except FileNotFoundError:
@@ -106,8 +117,12 @@ def kept(path: Path) -> TrialResult | None:
 
 @dataclass(frozen=True)
 class Faultless:
-    """Runs without faults in real time, `seconds` of simulated time, under `load`: a command, or ""
-    for alone.
+    """Runs without faults in real time.
+
+    Attributes:
+        load: Description of the load on the machine. Empty without load.
+        seconds: Simulated time of the runs, s.
+        runs: Results of the runs.
     """
 
     load: str
@@ -116,17 +131,17 @@ class Faultless:
 
     @property
     def trips(self) -> int:
-        """False trips: detections, and boards that died of no fault."""
+        """Number of false trips: detections, and deaths of boards without a fault."""
         return sum(len(run.unexplained) for run in self.runs)
 
     @property
     def rate(self) -> EventRate | None:
-        """The rate of false trips."""
+        """Rate of false trips. None if there were no runs."""
         return rate(self.trips, self.seconds)
 
     @property
     def misses(self) -> dict[str, int]:
-        """The number of misses by code: a busy machine explains them."""
+        """Number of deadline misses by code. A busy machine explains them."""
         total: Counter[str] = Counter()
         for run in self.runs:
             total.update(run.misses)
@@ -134,12 +149,12 @@ class Faultless:
 
     def document(self) -> Document:
         """Return the figures as plain data."""
-        an_hour = asdict(self.rate) if self.rate else None
+        rate_document = asdict(self.rate) if self.rate else None
         return {
             "load": self.load,
             "seconds": round(self.seconds, 3),
             "trips": self.trips,
-            "trips_per_hour": an_hour,
+            "trips_per_hour": rate_document,
             "tripped": [asdict(event) for run in self.runs for event in run.unexplained],
             "misses": self.misses,
         }
@@ -147,9 +162,15 @@ class Faultless:
 
 @dataclass
 class Results:
-    """Everything that a campaign has done. `nominal` is its faultless run in lockstep.
+    """Everything that a campaign has done.
 
-    `lacking`: lines about faults that did not strike, however often they were drawn.
+    Attributes:
+        nominal: Faultless run in lockstep.
+        trials: Trials with faults and kills.
+        sizes: Trials for curves of size against delay.
+        faultless: Faultless time.
+        lacking: Lines about faults that did not act although they were drawn repeatedly.
+        is_interrupted: Whether the campaign was interrupted.
     """
 
     nominal: TrialResult
@@ -161,24 +182,25 @@ class Results:
 
     @property
     def runs(self) -> list[TrialResult]:
-        """All runs, of whatever purpose."""
-        calm = [run for part in self.faultless for run in part.runs]
-        return [self.nominal, *self.trials, *self.sizes, *calm]
+        """All runs of any purpose."""
+        faultless = [run for stretch in self.faultless for run in stretch.runs]
+        return [self.nominal, *self.trials, *self.sizes, *faultless]
 
     @property
     def ended(self) -> Counter[Ended]:
-        """The number of trials by how their task ended."""
+        """Number of trials by how they ended."""
         return Counter(run.ended for run in self.trials)
 
     @property
     def faults(self) -> list[Judgement]:
-        """The judgements of all trials, without the sweep of sizes."""
+        """Judgements of all trials, without the trials for curves of size."""
         return [fault for run in self.trials for fault in run.faults]
 
 
 def _verdict(trial: Trial) -> FaultVerdict:
+    """Judge the faults of a trial."""
     if trial.run is None:
-        # The refusal is the detection of a fault that prevents a launch.
+        # A fault that prevents a launch is detected by the refusal of the launch.
         tables = trial.plan.faults
         judged = tuple(_at_start(table["kind"], table["board"], trial) for table in tables)
         return FaultVerdict(judged, ())
@@ -186,6 +208,7 @@ def _verdict(trial: Trial) -> FaultVerdict:
 
 
 def _at_start(kind: str, board: str, trial: Trial) -> Judgement:
+    """Judge a fault of a rack whose launch was refused."""
     if KINDS[kind].where != "start":
         return Judgement(kind, board, -1, "not struck")
     is_found = f"'{board}'" in trial.refused
@@ -204,6 +227,7 @@ def _at_start(kind: str, board: str, trial: Trial) -> Judgement:
 
 
 def _ended(trial: Trial) -> Ended:
+    """Return how a trial ended."""
     outcome = trial.outcome
     if trial.refused:
         is_to_be_refused = any(KINDS[table["kind"]].where == "start" for table in trial.plan.faults)
@@ -218,17 +242,18 @@ def _ended(trial: Trial) -> Ended:
 
 
 def _shortfalls(trial: Trial, verdict: FaultVerdict, ended: Ended) -> tuple[str, ...]:
+    """Return what was wrong in a trial, a line each."""
     lines = [line for fault in verdict.faults if fault.is_judged for line in _of_fault(fault)]
     lines += [
-        f"{event.board}: {event.text}: no fault explains it (tick {event.tick})"
+        f"no fault explains this event of {event.board} at tick {event.tick}: {event.text}"
         for event in verdict.unexplained
     ]
     if trial.arm.violations:
         lines.append(f"limits violated at {trial.arm.violations} substeps")
-    lines += [f"left behind: {thing}" for thing in trial.left]
+    lines += [f"left behind: {leftover}" for leftover in trial.left]
     if ended == "neither":
         lines.append(f"the task is neither done nor safely stopped: {_why_not_done(trial)}")
-    # A fault had to end the task if it is latched, or if reactions have taken the task's time.
+    # A fault had to end the task if it latched, or if the reactions to it made the task too late.
     had_to_end = any(
         fault.is_latched or (trial.is_late and fault.reactions) for fault in verdict.faults
     )
@@ -238,6 +263,7 @@ def _shortfalls(trial: Trial, verdict: FaultVerdict, ended: Ended) -> tuple[str,
 
 
 def _why_not_done(trial: Trial) -> str:
+    """Return why the task of a trial was not done."""
     outcome = trial.outcome
     if trial.refused:
         return trial.refused
@@ -247,19 +273,22 @@ def _why_not_done(trial: Trial) -> str:
 
 
 def _of_fault(fault: Judgement) -> Iterator[str]:
+    """Yield what was wrong with the detection of a fault, the reactions to it and its recovery."""
     target = f"{fault.mailbox or fault.board} {fault.joint}".rstrip()
-    strike = f"{fault.kind} of {target}, struck at tick {fault.struck}"
+    strike = f"{fault.kind} of {target} at tick {fault.struck}"
     if fault.seen == "missed":
-        yield f"{strike}: not detected"
+        yield f"{strike} was not detected"
     if fault.seen == "detected" and not fault.is_within:
-        after = f"{fault.delay} ticks; bound {fault.bound}"
+        delay_text = f"{fault.delay} ticks; its bound is {fault.bound}"
         if fault.bound_ms is not None:
-            after = f"{fault.delay_ms:g} ms; bound {fault.bound_ms:g}"
-        yield f"{strike}: {fault.found_as} by {fault.found_by} after {after}"
-    yield from (f"{strike}: no {code.replace('_', ' ')} follows" for code in fault.lacking)
+            delay_text = f"{fault.delay_ms:g} ms; its bound is {fault.bound_ms:g} ms"
+        yield f"{strike} was reported as {fault.found_as} by {fault.found_by} after {delay_text}"
+    yield from (
+        f"{strike} was not followed by '{code.replace('_', ' ')}'" for code in fault.lacking
+    )
     if not fault.is_recovered:
-        lost = ", ".join(fault.reactions) or "loss of messages"
+        reaction_text = ", ".join(fault.reactions) or "loss of messages"
         undone = "never undone"
         if fault.recovery is not None:
-            undone = f"undone after {fault.recovery} ticks"
-        yield f"{strike}: {lost} {undone}; bound {fault.recovery_bound}"
+            undone = f"undone only after {fault.recovery} ticks"
+        yield f"{strike}: {reaction_text} was {undone} (bound in ticks: {fault.recovery_bound})"

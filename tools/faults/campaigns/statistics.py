@@ -1,4 +1,4 @@
-"""The figures of a campaign: shares with their confidence, rates, delays, by kind of fault."""
+"""Figures of a campaign by kind of fault: shares with confidence intervals, rates and delays."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rack.tools.faults.judge import Judgement
 
 @dataclass(frozen=True)
 class FaultCounts:
-    """Numbers of the faults that must be found: all that were drawn, and what became of them."""
+    """Numbers of the faults that must be detected, by what became of them."""
 
     drawn: int
     injected: int
@@ -37,11 +37,19 @@ class Spread:
 
 @dataclass(frozen=True)
 class KindFigures(FaultCounts):
-    """The figures of one kind.
+    """Figures of one kind.
 
-    `wilson`: bounds of the 95 % intervals of shares of the injected, None where there are none.
-    `bound` in words; `bound_ticks`: the least and the most of its ticks. `cycles`, `ticks`, `ms`:
-    times to detection; `part_of_bound`: 1 is the bound.
+    Attributes:
+        wilson: Bounds of the 95 % confidence intervals of shares of the injected faults. None if
+            none were injected.
+        bound: Detection bound as text.
+        cycles: Delays to detection, cycles.
+        ticks: Delays to detection, ticks.
+        bound_ticks: Least and largest bound, ticks.
+        part_of_bound: Delays as fractions of their bounds.
+        ms: Delays to detection, ms.
+        reactions: Codes of reactions.
+        recovery_ms: Times to recovery in simulated time, ms.
     """
 
     wilson: dict[str, tuple[float, float] | None]
@@ -57,7 +65,7 @@ class KindFigures(FaultCounts):
 
 @dataclass(frozen=True)
 class EventRate:
-    """Events an hour, and the rate that they stay below with 95 % confidence."""
+    """Rate of events per hour, and the rate below which it lies with 95 % confidence."""
 
     an_hour: float
     below: float
@@ -65,7 +73,7 @@ class EventRate:
 
 @dataclass(frozen=True)
 class SizePoint:
-    """A point of a curve of size against delay; delay None: it was not found."""
+    """A point of a curve of size against delay. The delay is None for an undetected fault."""
 
     size: float
     joint: str
@@ -75,29 +83,33 @@ class SizePoint:
 
 @dataclass(frozen=True)
 class SizeCurve:
-    """A curve of size against delay; errors must be found from the size `judged_from`."""
+    """A curve of size against delay. Faults must be detected from the size `judged_from`."""
 
     judged_from: float
     curve: list[SizePoint]
 
 
 def by_kind(faults: Sequence[Judgement], clock_ns: int) -> dict[str, KindFigures]:
-    """Return the figures of each kind, in the order of `KINDS`; only faults that must be found
-    count.
+    """Return the figures of each kind in the order of `KINDS`.
+
+    Only faults that must be detected are counted.
     """
     judged = [fault for fault in faults if fault.is_judged]
     kinds = dict.fromkeys([*KINDS.names, EXTERNAL])
-    found = {kind: [fault for fault in judged if fault.kind == kind] for kind in kinds}
-    return {kind: _figures(kind, those, clock_ns) for kind, those in found.items() if those}
+    grouped = {kind: [fault for fault in judged if fault.kind == kind] for kind in kinds}
+    return {kind: _figures(kind, group, clock_ns) for kind, group in grouped.items() if group}
 
 
 Z95 = 1.959964
-"""Standard deviations of the normal distribution between which 95 % lie."""
+"""Number of standard deviations of the normal distribution between which 95 % lie."""
 RULE_95 = 0.05
 
 
 def wilson(count: int, of: int) -> tuple[float, float] | None:
-    """Return the bounds of Wilson's 95 % interval of a share; None where `of` is 0."""
+    """Return the bounds of Wilson's 95 % interval for the share `count` / `of`.
+
+    None if `of` is 0.
+    """
     if not of:
         return None
     share = count / of
@@ -108,9 +120,10 @@ def wilson(count: int, of: int) -> tuple[float, float] | None:
 
 
 def rate(count: int, seconds: float) -> EventRate | None:
-    """Return the rate of events; None where there is no time.
+    """Return the rate of events. None if there was no time.
 
-    The bound is the rate at which so few events have a probability of 5 % (Poisson).
+    The upper bound is the rate at which no more than `count` events have a probability of 5 %
+    (Poisson).
     """
     if seconds <= 0.0:
         return None
@@ -128,7 +141,7 @@ def rate(count: int, seconds: float) -> EventRate | None:
 
 
 def totals(faults: Iterable[Judgement]) -> FaultCounts:
-    """Return how many faults struck, were found, were found in time, and so on."""
+    """Count how many faults acted, were detected, were detected in time and so on."""
     judged = [fault for fault in faults if fault.is_judged]
     struck = [fault for fault in judged if fault.seen != "not struck"]
     return FaultCounts(
@@ -145,20 +158,30 @@ def totals(faults: Iterable[Judgement]) -> FaultCounts:
 
 
 def curve(faults: Iterable[Judgement], kind: str, clock_ns: int) -> list[SizePoint]:
-    """Return size against delay of one kind, smallest size first."""
-    found = [fault for fault in faults if fault.kind == kind and fault.struck >= 0]
-    points = [SizePoint(f.size or 0.0, f.joint, _ms(f.delay, clock_ns), f.delay) for f in found]
+    """Return the points of size against delay for one kind, the smallest size first.
+
+    Args:
+        faults: Judged faults of any kind.
+        kind: Name of the kind.
+        clock_ns: Length of a tick, ns.
+    """
+    struck = [fault for fault in faults if fault.kind == kind and fault.struck >= 0]
+    points = [
+        SizePoint(fault.size or 0.0, fault.joint, _ms(fault.delay, clock_ns), fault.delay)
+        for fault in struck
+    ]
     return sorted(points, key=lambda point: point.size)
 
 
 def spread(values: Iterable[float | None]) -> Spread | None:
-    """Return median and maximum of the values that there are; None where there are none."""
-    known = [value for value in values if value is not None]
-    return Spread(round(median(known), 3), round(max(known), 3)) if known else None
+    """Return median and maximum of the values that are not None, or None if all are."""
+    numbers = [value for value in values if value is not None]
+    return Spread(round(median(numbers), 3), round(max(numbers), 3)) if numbers else None
 
 
 def _figures(kind: str, faults: Sequence[Judgement], clock_ns: int) -> KindFigures:
-    seen = [fault for fault in faults if fault.seen == "detected"]
+    """Compute the figures of one kind."""
+    detected = [fault for fault in faults if fault.seen == "detected"]
     counts = vars(totals(faults))
     shares = ("detected", "within_bound", "recovered")
     bounds = [fault.bound for fault in faults if fault.bound is not None]
@@ -167,15 +190,16 @@ def _figures(kind: str, faults: Sequence[Judgement], clock_ns: int) -> KindFigur
         **counts,
         wilson={share: wilson(counts[share], counts["injected"]) for share in shares},
         bound=str(record_of(kind).bound),
-        cycles=spread(fault.delay / fault.cycle for fault in seen if fault.delay is not None),
-        ticks=spread(fault.delay for fault in seen),
+        cycles=spread(fault.delay / fault.cycle for fault in detected if fault.delay is not None),
+        ticks=spread(fault.delay for fault in detected),
         bound_ticks=bound_ticks,
-        part_of_bound=spread(fault.part_of_bound for fault in seen),
-        ms=spread(fault.delay_ms for fault in seen),
+        part_of_bound=spread(fault.part_of_bound for fault in detected),
+        ms=spread(fault.delay_ms for fault in detected),
         reactions=sorted({name for fault in faults for name in fault.reactions}),
-        recovery_ms=spread(_ms(fault.recovery, clock_ns) for fault in seen),
+        recovery_ms=spread(_ms(fault.recovery, clock_ns) for fault in detected),
     )
 
 
 def _ms(ticks: int | None, clock_ns: int) -> float | None:
+    """Convert ticks to ms."""
     return None if ticks is None else round(ticks * clock_ns * 1e-6, 3)

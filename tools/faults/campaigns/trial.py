@@ -32,27 +32,28 @@ from rack.tools.faults.judge import Circumstances
 
 MAX_LENGTH = 4
 GRACE_S = 60.0
-"""A run with faults is stopped after this multiple of a faultless run's length, and this simulated
-time more."""
+"""A run is stopped after `MAX_LENGTH_FACTOR` times a faultless run's length plus `GRACE_S`."""
 NOMINAL_S = 1800.0
-"""Simulated time of a run whose length is unknown."""
+"""Simulated time allowed for a run whose length is unknown."""
 STILL_S = 120.0
-"""Longest time without a tick: no rack plans for longer."""
+"""Maximum real time without a tick. No rack plans for longer."""
 STUCK_S = 20.0
-"""Longest time from a request to stop to the end."""
+"""Maximum real time from a request to stop to the end."""
 LOOK_S = 0.001
-"""Time between two looks at the tick in lockstep, which has no grid to sleep on."""
+"""Interval at which the tick is checked in lockstep, which has no grid on which to sleep."""
 HELD_S = 0.004
-"""Time between two looks at a rack that may be held."""
+"""Interval at which a rack that may be held is checked."""
 AGAIN_S = 2.0
-"""Simulated time of the run that follows a refused launch: each task has its cycles."""
+"""Simulated time of the run after a refused launch, in which each task has some cycles."""
 RETRY_S = 0.02
-"""Time after which a kill is tried again where the board is being restarted."""
+"""Time after which a kill is tried again if its board is being restarted."""
 
 
 class Killer:
-    """Kills boards of one rack by SIGKILL, at their instants, without the fault table. `done` are
-    the kills so far.
+    """Kills boards of one rack by SIGKILL at given instants, without the fault table.
+
+    Attributes:
+        done: The kills so far.
     """
 
     def __init__(self, segment: Segment, kills: Sequence[Kill]) -> None:
@@ -63,16 +64,16 @@ class Killer:
         self.done: list[Strike] = []
 
     def due_in_s(self) -> float:
-        """Return the time until the next kill, at most half a second."""
+        """Return the time until the next kill, at most 0.5 s."""
         if not self._waiting:
             return 0.5
         if self._words[System.LOCKSTEP]:
             return LOOK_S
-        at = max(self._instant_ns() * 1e-9, self._retry_at)
-        return min(0.5, max(0.0, at - time.monotonic()))
+        kill_s = max(self._instant_ns() * 1e-9, self._retry_at)
+        return min(0.5, max(0.0, kill_s - time.monotonic()))
 
     def advance(self) -> None:
-        """Kill the board whose instant has come; one that is not running, as soon as it is."""
+        """Kill the board whose instant has come. If it is not running, try again later."""
         words = self._words
         if not self._waiting or time.monotonic() < self._retry_at:
             return
@@ -81,7 +82,7 @@ class Killer:
             return
         wait_ns = self._instant_ns() - time.monotonic_ns()
         if words[System.LOCKSTEP]:
-            # Here the phase only spreads kills over what boards do in their ticks.
+            # In lockstep the phase only varies what the board is doing when it is killed.
             wait_ns = round(kill.phase * words[System.PERIOD_NS])
         time.sleep(max(0, wait_ns) * 1e-9)
         if self._kill(kill.board):
@@ -90,11 +91,13 @@ class Killer:
             self._retry_at = time.monotonic() + RETRY_S
 
     def _instant_ns(self) -> int:
+        """Return the CLOCK_MONOTONIC of the next kill, ns."""
         kill = self._waiting[0]
         words = self._words
         return words[System.EPOCH_NS] + round((kill.tick + kill.phase) * words[System.PERIOD_NS])
 
     def _kill(self, board: str) -> bool:
+        """Kill a board and record it. Return False if it is not running."""
         pid = self._pid(board)
         if not is_alive(pid):
             return False
@@ -107,7 +110,7 @@ class Killer:
         return False
 
     def _pid(self, board: str) -> int:
-        """Return the process of a board that is running; 0 for another."""
+        """Return the process of a running board, or 0 if the board is not running."""
         if board == CLOCK:
             return self._words[System.CLOCK_PID]
         block = self._segment.block(board)
@@ -116,7 +119,14 @@ class Killer:
 
 
 def kill_from_outside(layout: Layout, board: str, tick: int, time_ns: int) -> Strike:
-    """Return the kill of a board at `tick` and at CLOCK_MONOTONIC `time_ns`."""
+    """Return the record of a kill from outside.
+
+    Args:
+        layout: Layout of the rack.
+        board: Board that was killed.
+        tick: Tick of the kill.
+        time_ns: CLOCK_MONOTONIC of the kill, ns.
+    """
     return Strike(
         fault=-1,
         kind=EXTERNAL,
@@ -131,13 +141,23 @@ def kill_from_outside(layout: Layout, board: str, tick: int, time_ns: int) -> St
 
 @dataclass(frozen=True)
 class Trial:
-    """A trial that was made. `refused` is the reason why the rack did not launch, else empty.
+    """A trial that was run.
 
-    `again`: how a run without its faults ended, right after it was refused. `left` is everything
-    that it left behind. `levels` holds the last state of each level; `is_late`: one gave up because
-    it could not meet a time. `run`: what the judge must know of it; None where it was refused.
-    `events` are those of a whole run, wherever it has its `start`. `is_cut`: it was ended when the
-    verdict on each of its faults was certain.
+    Attributes:
+        plan: Plan of the trial.
+        run: Facts about the run for the judge. None if the launch was refused.
+        outcome: Outcome of the run.
+        refused: Why the rack did not launch. Empty if it did.
+        events: Events of the whole run, including those before the `start`.
+        strikes: Faults of the run.
+        arm: State of the arm at the end.
+        left: Everything that the rack left behind.
+        wall_s: Duration in real time, s.
+        levels: Last state of each level, as text.
+        is_late: Whether a level gave up because it could not meet a time.
+        again: Outcome of a run without the faults right after a refused launch.
+        start: Where the trial started.
+        is_cut: Whether it was ended early because the verdict on each fault was certain.
     """
 
     plan: Plan
@@ -166,23 +186,33 @@ def run_trial(
     base: BaseRack | None = None,
     crate: WarmCrate | None = None,
 ) -> Trial:
-    """Run a plan, and return its outcome, events and strikes.
+    """Run a plan and return everything that its judgement needs.
 
-    `ticks` is the length of a faultless run; `seconds` of simulated time, for a rack that no task
-    ends. It goes on from a snapshot of `base` if it can, which is in that `crate`, and then ends as
-    soon as the verdict on each of its faults is certain.
-    Raises `ConfigError` for a plan that does not fit the config.
+    If possible, the trial continues from a snapshot of the faultless rack. It then ends as soon as
+    the verdict on each of its faults is certain.
+
+    Args:
+        config: Config of the rack, without faults.
+        plan: Plan of the trial.
+        rack_name: Name of the rack.
+        ticks: Length of a faultless run, ticks. 0 if unknown.
+        seconds: Simulated time of a rack that no task ends, s.
+        base: Faultless rack. None to run the whole trial.
+        crate: Crate that runs the rack and has the snapshots. None to start a new one.
+
+    Raises:
+        ConfigError: The plan does not fit the config.
     """
     start = Start(whole="as asked") if base is None else base.start_of(plan, crate, seconds)
-    before = children()
+    pids_before = children()
     started = time.monotonic()
     rack = Rack(plan.config(config, rack_name), crate=crate, continues=start.continues)
     refused = ""
     is_cut = False
     levels = ""
-    late = False
+    has_late_level = False
     arm = ArmEnd()
-    found: tuple[Strike, ...] = ()
+    strikes_seen: tuple[Strike, ...] = ()
     try:
         with rack:
             start = start.at(rack.begins_at)
@@ -194,41 +224,41 @@ def run_trial(
                 certainty = Certainty(rack, joints, _circumstances(rack, plan))
             _watch(rack, killer, ticks, seconds, certainty)
             is_cut = certainty is not None and certainty.is_reached
-            found = (*strikes(rack.segment, joints), *killer.done)
+            strikes_seen = (*strikes(rack.segment, joints), *killer.done)
             arm = arm_of(rack.segment)
             levels = levels_of(rack.segment)
-            late = is_late(rack.segment)
+            has_late_level = is_late(rack.segment)
     except ConfigError:
         raise
     except (BackplaneError, BoardError) as error:
         refused = str(error)
-    again = None
+    rerun_outcome = None
     run = None
     if not refused:
         run = _circumstances(rack, plan)
     elif plan.faults:
-        sound = replace(plan, faults=())
-        again = run_trial(config, sound, rack_name, ticks, AGAIN_S, crate=crate).outcome
+        faultless = replace(plan, faults=())
+        rerun_outcome = run_trial(config, faultless, rack_name, ticks, AGAIN_S, crate=crate).outcome
     return Trial(
         plan=plan,
         run=run,
         outcome=rack.outcome,
         refused=refused,
         events=tuple(sorted(rack.events, key=lambda event: event.tick)),
-        strikes=found,
+        strikes=strikes_seen,
         arm=arm,
-        left=tuple(left_behind(rack_name, before)),
+        left=tuple(left_behind(rack_name, pids_before)),
         wall_s=time.monotonic() - started,
         levels=levels,
-        is_late=late,
-        again=again,
+        is_late=has_late_level,
+        again=rerun_outcome,
         start=start,
         is_cut=is_cut,
     )
 
 
 def levels_of(segment: Segment) -> str:
-    """Return the last state of each level, with its reason, as one readable text."""
+    """Return the last state of each level with its reason, as one text."""
     states = []
     for writer, status in statuses(segment, "state"):
         reason = f" ({why})" if (why := reason_of(status)) else ""
@@ -237,14 +267,15 @@ def levels_of(segment: Segment) -> str:
 
 
 def is_late(segment: Segment) -> bool:
-    """Return whether a level gave up because it cannot meet a time."""
+    """Return True if a level gave up because it could not meet a time."""
     return any(
-        s.state == State.ERROR and s.error == Error.TOO_LATE for _, s in statuses(segment, "error")
+        status.state == State.ERROR and status.error == Error.TOO_LATE
+        for _, status in statuses(segment, "error")
     )
 
 
 def _circumstances(rack: Rack, plan: Plan) -> Circumstances:
-    """Return what the judge must know of a run."""
+    """Collect the facts that the judge needs about a run."""
     config = rack.config
     return Circumstances(
         layout=rack.segment.layout,
@@ -259,25 +290,25 @@ def _circumstances(rack: Rack, plan: Plan) -> Circumstances:
 def _watch(
     rack: Rack, killer: Killer, ticks: int, seconds: float | None, certainty: Certainty | None
 ) -> None:
-    """Watch a run to its end, and kill its boards as planned; no run lasts for ever."""
+    """Watch a run to its end and kill boards as planned. Stop it if it takes too long."""
     rack.start(seconds)
     words = rack.segment.words
-    most_s = GRACE_S if ticks else NOMINAL_S
-    most_ticks = MAX_LENGTH * ticks + max(most_s, seconds or 0.0) * 1e9 / rack.config.clock_ns
-    seen = -1
+    extra_s = GRACE_S if ticks else NOMINAL_S
+    max_ticks = MAX_LENGTH * ticks + max(extra_s, seconds or 0.0) * 1e9 / rack.config.clock_ns
+    last_tick = -1
     deadline = 0.0
     stopped = False
     while rack.watch(killer.due_in_s() if certainty is None else HELD_S):
         killer.advance()
         if certainty is not None:
             certainty.look()
-        now = time.monotonic()
-        if stopped and now > deadline:
+        now_s = time.monotonic()
+        if stopped and now_s > deadline:
             return
-        if not stopped and words[System.TICK] != seen:
-            seen = words[System.TICK]
-            deadline = now + STILL_S
-        if not stopped and (now > deadline or seen > most_ticks):
+        if not stopped and words[System.TICK] != last_tick:
+            last_tick = words[System.TICK]
+            deadline = now_s + STILL_S
+        if not stopped and (now_s > deadline or last_tick > max_ticks):
             rack.stop("the trial takes too long")
             stopped = True
-            deadline = now + STUCK_S
+            deadline = now_s + STUCK_S

@@ -1,5 +1,6 @@
-"""Worker processes make the trials, as many at once as there are cores; each trial has its own rack
-and leaves a file.
+"""Worker processes, which run trials in parallel.
+
+There are as many as cores. Each trial has its rack and leaves a file.
 """
 
 from __future__ import annotations
@@ -24,13 +25,18 @@ from rack.tools.faults.campaigns.results import keep
 from rack.tools.faults.campaigns.trial import run_trial
 
 LOOK_S = 0.2
-"""Longest time until a campaign that waits for its trials notices an interrupt."""
+"""Maximum time until a waiting campaign notices an interrupt."""
 
 
 @dataclass(frozen=True)
 class TrialJob:
-    """A trial to be made: `ticks` of a faultless run, `seconds` of simulated time where no task
-    ends the run.
+    """A trial to be run.
+
+    Attributes:
+        plan: Plan of the trial.
+        path: File for the result.
+        ticks: Length of a faultless run, ticks.
+        seconds: Simulated time of a rack that no task ends, s.
     """
 
     plan: Plan
@@ -40,10 +46,10 @@ class TrialJob:
 
 
 class Workers:
-    """Processes that make trials. Use it as a context; they end with it, and with the process that
-    made it.
+    """Processes that run trials, used as a context manager.
 
-    `whole`: no trial goes on from a snapshot of the faultless rack.
+    They end with the context and with the process that created them. With `whole`, every trial runs
+    from tick 0 instead of continuing from a snapshot.
     """
 
     def __init__(self, config: RackConfig, whole: bool = False) -> None:
@@ -66,46 +72,50 @@ class Workers:
     def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
         if kind is not None:
             self._stop()
-        # Workers without a trial end with the pool, and with them their crates.
+        # Idle workers, and their crates, end with the pool.
         self._pool.shutdown(cancel_futures=True)
 
     def run(self, jobs: Sequence[TrialJob], alone: bool) -> Iterator[TrialJob]:
-        """Make trials and yield each that is done and has its file; a signal ends those in
-        progress, which leave none.
+        """Run trials and yield each one when its file is written.
 
-        Trials that are `alone` have the machine for themselves. Others get a core each, where their
-        boards hand messages to each other sooner.
+        A signal ends the trials in progress, which leave no file.
+
+        Args:
+            jobs: Trials to run.
+            alone: Whether each trial has the whole machine. Otherwise each gets one core, which
+                also makes the exchange of messages between its boards faster.
+
+        Raises:
+            Failure: A trial could not be run.
         """
         waiting = list(jobs)
         busy = dict[Future[str], TrialJob]()
-        most = 1 if alone else self._most
+        max_busy = 1 if alone else self._most
         while (waiting or busy) and not INTERRUPT.number:
-            while waiting and len(busy) < most:
+            while waiting and len(busy) < max_busy:
                 job = waiting.pop(0)
                 busy[self._pool.submit(_make, job)] = job
             done, _ = wait(busy, LOOK_S, FIRST_COMPLETED)
             for future in done:
                 job = busy.pop(future)
                 try:
-                    wrong = future.result()
+                    error_text = future.result()
                 except BrokenProcessPool:
-                    wrong = "the process that made it ended"
-                if wrong:
-                    raise Failure(f"trial {job.plan.number}: {wrong}")
+                    error_text = "its worker process has ended"
+                if error_text:
+                    raise Failure(f"trial {job.plan.number} failed: {error_text}")
                 yield job
         if busy:
             self._stop()
 
     def _stop(self) -> None:
-        """End the workers. What is left of a trial in progress is of no use: its rack is removed,
-        not stopped.
-        """
+        """End the workers at once. The racks of trials in progress are removed, not stopped."""
         for process in active_children():
             process.terminate()
 
 
 class TrialMaker:
-    """What makes trials in one worker: its core, its crate, and the faultless rack in that."""
+    """Runs the trials of one worker with its core, its crate and its faultless rack."""
 
     def __init__(self, config: RackConfig, whole: bool, core: int) -> None:
         self._config = config
@@ -116,7 +126,7 @@ class TrialMaker:
         self._base = BaseRack(config, f"camp-{os.getpid()}x")
 
     def make(self, job: TrialJob) -> None:
-        """Make a trial, and keep its result."""
+        """Run a trial and save its result."""
         is_lockstep = job.plan.lockstep
         os.sched_setaffinity(0, {self._core} if is_lockstep else self._cores)
         crate = self._ready(is_lockstep)
@@ -128,8 +138,10 @@ class TrialMaker:
         keep(trial, job.path)
 
     def _ready(self, lockstep: bool) -> WarmCrate | None:
-        """Return the crate for the next trial; None: the rack starts its own, as in real time,
-        where a crate that has served would be another machine.
+        """Return the crate for the next trial, or None if the rack must start a new one.
+
+        Use a fresh crate for each real-time trial: a warm one has different cache and page-fault
+        behaviour.
         """
         if self._crate is not None and (self._crate.is_over or not lockstep):
             self._crate.end()
@@ -143,7 +155,7 @@ _maker: TrialMaker
 
 
 def _begin(config: RackConfig, whole: bool, cores: SimpleQueue[int], parent: int) -> None:
-    """Begin as a worker: it ends with its parent, and Ctrl-C on the terminal reaches only that."""
+    """Prepare a worker process. It ends with its parent and ignores Ctrl-C on the terminal."""
     global _maker
     os.setpgid(0, 0)
     INTERRUPT.catch()
@@ -152,9 +164,10 @@ def _begin(config: RackConfig, whole: bool, cores: SimpleQueue[int], parent: int
 
 
 def _make(job: TrialJob) -> str:
-    """Make a trial; return what went wrong, if anything."""
+    """Run a trial in a worker. Return what went wrong, or an empty string."""
     try:
         _maker.make(job)
-    except Exception as error:  # whatever it is, the campaign must hear of it
+    except Exception as error:
+        # Report any error, because the campaign would otherwise wait for the result.
         return f"{type(error).__name__}: {error}"
     return ""

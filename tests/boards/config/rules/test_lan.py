@@ -14,7 +14,7 @@ from rack.tools.network.certificates import make_credentials
 from tests.boards.lan.racks import rack_text
 
 TLS = "tls/127.0.0.1:7447"
-SHAPE = "permitted: tcp/, tls/ or quic/, an address or a host name, and a port from 1 to 65535"
+SHAPE = "it must be tcp/, tls/ or quic/ with an address or host name and a port from 1 to 65535"
 
 
 def mistakes(
@@ -66,8 +66,8 @@ def test_tcp_is_refused_unless_asked_for_by_name_or_sealed_on_loopback(
     ("endpoint", "why"),
     [
         ("tcp/127.0.0.1:0", SHAPE),
-        ("tcp/127.1:7447", f"'127.1' is no address; {SHAPE}"),
-        ("tcp/[1::2::3]:7447", f"'1::2::3' is no address; {SHAPE}"),
+        ("tcp/127.1:7447", f"'127.1' is not an address; {SHAPE}"),
+        ("tcp/[1::2::3]:7447", f"'1::2::3' is not an address; {SHAPE}"),
     ],
 )
 def test_a_malformed_endpoint_is_one_line(tmp_path: Path, endpoint: str, why: str) -> None:
@@ -91,7 +91,7 @@ def test_flaws_of_all_files_come_with_the_other_mistakes(tmp_path: Path) -> None
         'adapter.lan.connect[0] = "tcp/127.0.0.1:7448": without TLS, which others have'
     )
     files = ("authority.pem", "cell.pem", "cell-key.pem")
-    why = f"missing; see rack lan certificates --help; in {tmp_path}/certs"
+    why = f"the file is missing; see rack lan certificates --help; in {tmp_path}/certs"
     assert lines[1:] == [f"adapter.lan.certificates: {name}: {why}" for name in files]
 
 
@@ -105,7 +105,10 @@ def test_certificates_are_found_next_to_the_config_from_anywhere(
     assert loads(config.text()) == config
     os.chdir(tmp_path)
     (line,) = mistakes(tmp_path, TLS.replace("127.0.0.1", "127.0.0.2"), 'certificates = "certs"')
-    assert "cell.pem: not for address 127.0.0.2; for 127.0.0.1" in line
+    assert (
+        "cell.pem: the certificate is not valid for address 127.0.0.2; valid addresses: 127.0.0.1"
+        in line
+    )
 
 
 def test_nobody_could_import_over_tls_without_being_named(tmp_path: Path) -> None:

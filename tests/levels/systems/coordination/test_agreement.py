@@ -238,7 +238,7 @@ def test_arm_that_fails_ends_the_program_and_leaves_no_arm_moving(
 
 @given(STEADY, st.sampled_from(ARMS), st.integers(0, 40))
 @settings(max_examples=40, deadline=None)
-def test_arm_launched_anew_ends_the_program_or_has_lost_nothing(
+def test_arm_that_is_launched_again_ends_the_program_or_has_lost_nothing(
     events: list[frozenset[str] | str], arm: str, when: int
 ) -> None:
     play = Play()
@@ -253,7 +253,7 @@ def test_arm_launched_anew_ends_the_program_or_has_lost_nothing(
 @pytest.mark.parametrize(
     ("keeps_s", "error", "attempts"), [(3.0, Error.NONE, 1), (0.5, Error.TOO_LATE, MAX_ATTEMPTS)]
 )
-def test_promise_that_expires_is_asked_for_so_many_times(
+def test_expired_promise_is_requested_a_limited_number_of_times(
     keeps_s: float, error: Error, attempts: int
 ) -> None:
     play = Play(puma=PlayedArm(keeps_s=keeps_s))

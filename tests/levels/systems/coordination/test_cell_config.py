@@ -70,20 +70,17 @@ def mistakes(folder: Path, *changes: tuple[str, str]) -> str:
         (
             'arm = "k1607"',
             'arm = "puma"',
-            (
-                'task.step[0].do[1].arm = "puma": has another action in this step; permitted: one'
-                " action per arm"
-            ),
+            ('task.step[0].do[1].arm = "puma": this arm already has an action in this step'),
         ),
         (
             "by = 30.0",
             "by = 20.0",
-            "task.step[1].do[0].by = 20.0: an earlier step has 20; permitted: later than that",
+            "task.step[1].do[0].by = 20.0: must be later than 20, the time of an earlier step",
         ),
         (
             '[{ arm = "puma", do = "home", by = 30.0 }]',
             "[]",
-            "task.step[1].do = []: has no action; permitted: one or more",
+            "task.step[1].do = []: a step must have at least one action",
         ),
         (
             'do = "home", by = 30.0',
@@ -96,8 +93,8 @@ def mistakes(folder: Path, *changes: tuple[str, str]) -> str:
             'do = "home", by = 30.0',
             'do = "transfer", object = "a part whose name is longer than 32", to = [0, 0, 0]',
             (
-                'task.step[1].do[0].object = "a part whose name is longer than 32": permitted in an'
-                " order: at most 32 ASCII characters"
+                'task.step[1].do[0].object = "a part whose name is longer than 32": an order'
+                " can contain at most 32 ASCII characters"
             ),
         ),
     ],

@@ -101,7 +101,7 @@ def test_step_goes_to_all_its_arms_together_and_the_next_one_after_all_are_done(
     assert (bench.status.state, bench.status.action) == (State.DONE, 2)
 
 
-def test_orders_hold_what_the_program_says() -> None:
+def test_orders_contain_the_actions_of_the_program() -> None:
     bench = CellBench([TRANSFER, REACH], [BENT, AWAY])
     bench.both(Response.NONE)
     puma, k1607 = bench.order("puma"), bench.order("k1607")
@@ -180,7 +180,7 @@ def test_arm_that_is_lost_holds_the_others_and_the_program() -> None:
     assert bench.order("puma").hold == 0
 
 
-def test_restarted_board_goes_on_where_it_was() -> None:
+def test_restarted_board_continues_its_program() -> None:
     bench = CellBench([TRANSFER, REACH], [BENT])
     bench.both(Response.NONE)
     bench.both(Response.POSSIBLE)

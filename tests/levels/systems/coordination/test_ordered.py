@@ -146,7 +146,7 @@ class OrderBench(Lockstep):
         )
 
 
-def test_times_are_those_of_the_rack_that_gives_the_orders() -> None:
+def test_times_refer_to_the_clock_of_the_coordinators_rack() -> None:
     bench = OrderBench(ahead=100.0)
     bench.run(1.0)
     bench.order(OrderVerb.ASK, Home(by=114.0))
@@ -164,7 +164,7 @@ def test_times_are_those_of_the_rack_that_gives_the_orders() -> None:
     ("changes", "stray_rad", "plans"),
     [(False, 0.0, 1), (True, 0.0, 2), (False, 0.004, 1), (False, 0.006, 2)],
 )
-def test_promised_plan_is_made_anew_only_if_the_world_has_changed_or_the_arm_has_moved(
+def test_promised_plan_is_renewed_only_if_the_world_or_the_arm_has_changed(
     changes: bool, stray_rad: float, plans: int
 ) -> None:
     bench = OrderBench()
@@ -179,7 +179,7 @@ def test_promised_plan_is_made_anew_only_if_the_world_has_changed_or_the_arm_has
     assert bench.read("task.plan").id == bench.boxes["task.plan"].at(bench.tick)[0] == plans
 
 
-def test_order_under_way_is_broken_off_once_the_work_on_the_object_is_done() -> None:
+def test_order_is_interrupted_only_after_the_work_on_the_object() -> None:
     bench = OrderBench()
     bench.ask_and_do(TRANSFER)
     assert bench.run(20.0, lambda rack: bench.verb() is Verb.APPROACH)
@@ -201,7 +201,7 @@ def test_order_under_way_is_broken_off_once_the_work_on_the_object_is_done() -> 
     assert bench.report.response == Response.CANCELLED
 
 
-def test_free_motion_is_broken_off_at_once_for_the_end_of_the_program() -> None:
+def test_free_motion_is_interrupted_at_once_at_the_end_of_the_program() -> None:
     bench = OrderBench()
     bench.ask_and_do(TRANSFER)
     assert bench.run(5.0, lambda rack: bench.verb() is Verb.MOVE)
@@ -212,7 +212,7 @@ def test_free_motion_is_broken_off_at_once_for_the_end_of_the_program() -> None:
     assert bench.read("elemental_move.status").done == 1
 
 
-def test_arm_is_held_while_its_orders_are_lost_and_goes_on_with_the_same_order() -> None:
+def test_arm_holds_while_its_orders_are_lost_and_then_continues() -> None:
     bench = OrderBench(stalled_s=3.0)
     bench.order(OrderVerb.NONE, number=0)
     bench.run(8.0)
@@ -235,7 +235,7 @@ def test_arm_is_held_while_its_orders_are_lost_and_goes_on_with_the_same_order()
 @pytest.mark.slow
 @pytest.mark.parametrize("board", ["task", "task.planner"])
 @pytest.mark.parametrize("cycle", range(1, 14, 3))
-def test_order_is_done_once_in_whatever_cycle_a_board_dies(board: str, cycle: int) -> None:
+def test_order_is_done_once_whenever_a_board_dies(board: str, cycle: int) -> None:
     bench = OrderBench()
     bench.after(cycle * EVERY + 10, lambda: bench.lose(board, 60))
     bench.ask_and_do(HOME)
@@ -244,7 +244,7 @@ def test_order_is_done_once_in_whatever_cycle_a_board_dies(board: str, cycle: in
     assert (bench.status.action, bench.status.actions) == (1, 1)
 
 
-def test_order_that_stands_still_fails_with_the_reason() -> None:
+def test_order_without_progress_fails_with_the_reason() -> None:
     bench = OrderBench(stalled_s=3.0)
     bench.ask_and_do(TRANSFER)
     bench.lose("elemental_move", 100_000)

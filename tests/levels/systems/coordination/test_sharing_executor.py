@@ -183,7 +183,7 @@ def test_a_hand_over_and_back_has_one_owner_at_a_time(pair: Pair) -> None:
     )
 
 
-def test_of_two_arms_that_take_the_part_at_once_the_name_decides(pair: Pair) -> None:
+def test_the_name_decides_between_two_arms_that_take_the_part_at_once(pair: Pair) -> None:
     hoists = pair.alpha, pair.beta
     for hoist in hoists:
         hoist.go(0.0)
@@ -199,7 +199,7 @@ def test_of_two_arms_that_take_the_part_at_once_the_name_decides(pair: Pair) -> 
 @pytest.mark.parametrize(
     "restarted", [lambda pair: pair.alpha, lambda pair: pair.beta], ids=["owner", "other"]
 )
-def test_the_part_stays_where_it_is_across_a_restart_of_a_servo_board(
+def test_the_part_stays_in_place_during_a_restart_of_a_servo_board(
     pair: Pair, restarted: Callable[[Pair], Hoist]
 ) -> None:
     pair.lift(pair.alpha)
@@ -227,7 +227,7 @@ def word(rack: bytes, claim: Claim, x: float, name: bytes = b"part") -> Message:
     return message
 
 
-def test_only_the_owner_says_where_its_body_is() -> None:
+def test_only_the_owner_reports_the_pose_of_a_body() -> None:
     body = SharedBody(b"part", b"alpha")
     owned = Claim(3, b"beta")
     assert body.hear(word(b"gamma", owned, 1.0)) is not None, "the claim is news, from wherever"

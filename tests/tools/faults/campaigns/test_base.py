@@ -116,7 +116,7 @@ def bench(small: Path, rack_name: str, crate: WarmCrate, monkeypatch: pytest.Mon
 
 
 @pytest.mark.slow
-def test_a_trial_goes_on_from_before_its_first_fault_and_ends_once_its_verdict_is_certain(
+def test_a_trial_continues_from_a_snapshot_and_ends_once_its_verdict_is_certain(
     bench: Bench,
 ) -> None:
     plan = Plan(1, "faults", True, (MUTE, {**MUTE, "tick": 520}))
@@ -136,7 +136,7 @@ def test_a_trial_goes_on_from_before_its_first_fault_and_ends_once_its_verdict_i
 
 
 @pytest.mark.slow
-def test_kills_from_outside_are_made_to_the_end_of_the_run(bench: Bench) -> None:
+def test_trials_with_kills_from_outside_run_to_the_end(bench: Bench) -> None:
     plan = Plan(1, "kills", True, (), (Kill("lower", 600, 0.5),))
     found = bench.run(plan)
     assert not found.is_cut
@@ -144,7 +144,7 @@ def test_kills_from_outside_are_made_to_the_end_of_the_run(bench: Bench) -> None
 
 
 @pytest.mark.slow
-def test_what_cannot_go_on_from_a_snapshot_says_why(bench: Bench) -> None:
+def test_a_trial_that_cannot_continue_from_a_snapshot_says_why(bench: Bench) -> None:
     soon = Plan(1, "faults", True, (MUTE,))
     early = Plan(1, "faults", True, ({"kind": "self-test", "board": "lower"},))
     assert bench.base.start_of(replace(soon, lockstep=False), None, SECONDS) == Start(

@@ -122,7 +122,7 @@ def test_each_kind_strikes_as_often_as_ordered(make: MakeCampaign) -> None:
     assert [run.plan for run in results.trials] == trials.made[1:]
 
 
-def test_what_did_not_strike_is_drawn_again_and_in_the_end_said(make: MakeCampaign) -> None:
+def test_faults_that_did_not_act_are_drawn_again_and_finally_reported(make: MakeCampaign) -> None:
     def never_mute(plan: Plan) -> TrialResult:
         found = struck(plan)
         faults = [
@@ -136,10 +136,10 @@ def test_what_did_not_strike_is_drawn_again_and_in_the_end_said(make: MakeCampai
     # Each round more of them, up to four of each that is missing.
     again = sum(min(turn + 1, module.MOST_AGAIN) for turn in range(1, module.ROUNDS))
     assert (kinds.count("mute"), kinds.count("drop")) == (3 + 3 * again, 3)
-    assert results.lacking == [f"mute: struck 0 of 3 times, in {module.ROUNDS} rounds"]
+    assert results.lacking == [f"mute acted only 0 of 3 times in {module.ROUNDS} rounds"]
 
 
-def test_trials_that_are_kept_are_not_made_again(make: MakeCampaign) -> None:
+def test_saved_trials_are_not_repeated(make: MakeCampaign) -> None:
     first, trials = make()
     before = first.run()
     second, again = make()
@@ -156,7 +156,7 @@ def test_trials_that_are_kept_are_not_made_again(make: MakeCampaign) -> None:
     assert once_more.made == [trials.made[1]]
 
 
-def test_it_is_the_same_campaign_whichever_way_its_trials_are_made(make: MakeCampaign) -> None:
+def test_a_campaign_continued_with_whole_trials_keeps_saved_ones(make: MakeCampaign) -> None:
     campaign, trials = make()
     campaign.run()
     assert not trials.whole
@@ -169,7 +169,7 @@ def test_it_is_the_same_campaign_whichever_way_its_trials_are_made(make: MakeCam
 
 def test_a_folder_of_another_campaign_is_refused(make: MakeCampaign) -> None:
     make()[0].run()
-    with pytest.raises(Failure, match="holds another campaign; it differs in seed") as caught:
+    with pytest.raises(Failure, match="belongs to a campaign that differs in seed") as caught:
         make(seed=6)[0].run()
     assert caught.value.status == 2
 
@@ -190,7 +190,7 @@ def test_a_rack_whose_task_fails_without_faults_has_no_campaign(
     assert len(trials.made) == 1
 
 
-def test_a_trial_that_falls_short_leaves_a_plan_that_repeats_it(make: MakeCampaign) -> None:
+def test_a_trial_with_shortfalls_leaves_a_plan_that_repeats_it(make: MakeCampaign) -> None:
     def late(plan: Plan) -> TrialResult:
         return replace(struck(plan), shortfalls=("late",) if plan.number == 1 else ())
 
@@ -201,7 +201,7 @@ def test_a_trial_that_falls_short_leaves_a_plan_that_repeats_it(make: MakeCampai
     assert path.read_text() == trials.made[1].toml("small")
 
 
-def test_a_rack_that_is_done_in_time_is_run_as_often_as_fills_the_faultless_time(
+def test_short_runs_are_repeated_to_fill_the_faultless_time(
     make: MakeCampaign,
 ) -> None:
     campaign, trials = make(faultless_s=25.0, modes=(False,), kinds="mute", loads=(False,))

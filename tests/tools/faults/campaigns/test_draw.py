@@ -112,7 +112,7 @@ def _undone(kind: str, board: str, course: RackUnderTest) -> int:
     return KINDS[kind].recovery_ticks(board, course.targets.layout, course.restart_s)
 
 
-def test_a_mailbox_is_struck_again_only_where_its_readers_would_tell_of_it_again(
+def test_a_mailbox_is_affected_again_only_if_its_readers_would_report_it(
     course: RackUnderTest,
 ) -> None:
     layout, again = course.targets.layout, 0
@@ -139,13 +139,17 @@ def _lasts(table: Mapping[str, Any]) -> int:
 @pytest.mark.parametrize(
     ("wanted", "lockstep", "why"),
     [
-        ("kill,murder", False, "--kinds murder: no such kind; kinds: kill, hang, "),
-        ("lock-held", False, "--kinds lock-held: nothing in this rack can have it; kinds: "),
-        ("hog", True, "--kinds hog: hog needs real time, and the campaign is in lockstep; kinds: "),
-        (" , ", False, "--kinds: names no kind; kinds: "),
+        ("kill,murder", False, "--kinds murder: there is no such kind; valid kinds: kill, hang, "),
+        ("lock-held", False, "--kinds lock-held: nothing in this rack can have it; valid kinds: "),
+        (
+            "hog",
+            True,
+            "--kinds hog: hog needs real time, and the campaign is in lockstep; valid kinds: ",
+        ),
+        (" , ", False, "--kinds names no kind; valid kinds: "),
     ],
 )
-def test_a_kind_that_cannot_be_is_refused_in_one_line(
+def test_an_impossible_kind_is_refused_in_one_line(
     course: RackUnderTest, wanted: str, lockstep: bool, why: str
 ) -> None:
     with pytest.raises(Failure) as refused:

@@ -22,7 +22,7 @@ def documents(plans: list[Plan], config: str) -> list[object]:
 
 @pytest.mark.parametrize("name", RACKS)
 @pytest.mark.parametrize("seed", [SEED, SEED + 1])
-def test_a_seed_draws_the_plans_that_it_drew_before(name: str, seed: int) -> None:
+def test_the_plans_of_a_seed_are_unchanged(name: str, seed: int) -> None:
     config = load(ROOT / "configs" / name)
     layout = wire(config)
     targets = Targets(config, layout)

@@ -79,6 +79,6 @@ def test_a_counter_of_violations_that_does_not_count_ends_the_campaign(
     examine(config.load("fig4"))
     examine(config.load("nasrem"))
     monkeypatch.setattr(Simulation, "_judge_limits", lambda plant: False)
-    why = r"violation counter: joint 'j1' at \d+.* rad/s, twice its limit, is not counted"
+    why = r"the violation counter does not count joint 'j1' at \d+.* rad/s, twice its limit"
     with pytest.raises(Failure, match=why):
         examine(config.load("nasrem"))

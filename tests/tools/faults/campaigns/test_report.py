@@ -98,7 +98,7 @@ class Ordered:
     modes = (True, False)
 
 
-def test_the_figures_are_of_the_runs_that_they_are_about(report: dict[str, Any]) -> None:
+def test_the_figures_summarise_the_right_runs(report: dict[str, Any]) -> None:
     summary = report["summary"]
     assert {key: summary[key] for key in ("trials", "tasks_done", "safely_stopped", "neither")} == {
         "trials": 3,
@@ -128,7 +128,7 @@ def test_the_figures_are_of_the_runs_that_they_are_about(report: dict[str, Any])
     assert report["shortfalls"] == ["trial 2: late", "overrun: did not strike"]
 
 
-def test_the_text_says_what_the_document_holds(made: CampaignReport) -> None:
+def test_the_text_agrees_with_the_document(made: CampaignReport) -> None:
     lines = made.markdown().splitlines()
     assert lines[0] == "# Campaign on small, seed 9: fell short"
     assert lines[2].startswith("3 trials, lockstep and realtime, in 61 s on ")
@@ -156,7 +156,7 @@ def test_the_text_says_what_the_document_holds(made: CampaignReport) -> None:
 def test_a_campaign_without_shortfalls_has_passed() -> None:
     text = report_of(Results(RUN, is_interrupted=True)).markdown()
     assert text.startswith("# Campaign on small, seed 9: passed\n")
-    assert "Interrupted: results until then." in text
+    assert "The campaign was interrupted." in text
     assert not any(
         word in text for word in ("Shortfalls", "Faults by kind", "Faultless", "of these without")
     )

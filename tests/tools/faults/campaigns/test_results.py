@@ -53,25 +53,25 @@ def refused(kind: str, why: str, again: Outcome | None = None) -> TrialResult:
     return result_of(made)
 
 
-MUTED = "mute of lower.status, struck at tick 100"
+MUTED = "mute of lower.status at tick 100"
 BAD = [
-    (trial(FLOWS), f"{MUTED}: not detected"),
+    (trial(FLOWS), f"{MUTED} was not detected"),
     (
         trial(found(140, "mute", "upper", "lower.status"), FLOWS),
-        f"{MUTED}: mute by upper after 40 ticks; bound 10",
+        f"{MUTED} was reported as mute by upper after 40 ticks; its bound is 10",
     ),
     (
         trial(SEEN, FLOWS, event(110, "reaction", "restart", "lower")),
-        f"{MUTED}: restart never undone; bound 152",
+        f"{MUTED}: restart was never undone (bound in ticks: 152)",
     ),
-    (trial(SEEN), f"{MUTED}: loss of messages never undone; bound 152"),
+    (trial(SEEN), f"{MUTED}: loss of messages was never undone (bound in ticks: 152)"),
     (
         trial(SEEN, flows(300)),
-        f"{MUTED}: loss of messages undone after 200 ticks; bound 152",
+        f"{MUTED}: loss of messages was undone only after 200 ticks (bound in ticks: 152)",
     ),
     (
         trial(found(100, "command_invalid", "lower"), strikes=(NAN,)),
-        "command-nan of lower, struck at tick 100: no brakes closed follows",
+        "command-nan of lower at tick 100 was not followed by 'brakes closed'",
     ),
     (
         replace(GOOD, outcome=outcome("task failed", "level 'lower': blocked")),
@@ -81,7 +81,7 @@ BAD = [
     (replace(GOOD, left=("process 7 (x:servo)",)), "left behind: process 7 (x:servo)"),
     (
         trial(SEEN, FLOWS, found(9000, "gap", "upper", "lower.status")),
-        "upper: gap: no fault explains it (tick 9000)",
+        "no fault explains this event of upper at tick 9000: gap",
     ),
     (
         replace(GOOD, outcome=outcome("stopped"), levels="lower executing"),
@@ -91,12 +91,12 @@ BAD = [
 
 
 @pytest.mark.parametrize(("bad", "line"), BAD)
-def test_each_shortfall_is_a_line(bad: Trial, line: str) -> None:
+def test_each_shortfall_is_one_line(bad: Trial, line: str) -> None:
     assert (result_of(GOOD).ended, result_of(GOOD).shortfalls) == ("task done", ())
     assert result_of(bad).shortfalls == (line,)
 
 
-def test_a_task_is_safely_stopped_when_the_arm_stands_and_no_limit_was_violated() -> None:
+def test_a_task_is_safely_stopped_if_the_arm_is_at_rest_within_its_limits() -> None:
     lost = replace(GOOD, outcome=outcome("board lost", "board 'lower' ended"))
     assert result_of(lost).ended == "safely stopped"
     assert result_of(replace(lost, arm=ArmEnd(is_at_rest=False))).ended == "neither"
@@ -121,7 +121,7 @@ def test_a_self_test_that_fails_is_found_when_the_rack_does_not_arm_because_of_i
     # It is recovered from when the rack then runs without it.
     for again in (None, outcome("board lost", "board 'lower' ended")):
         assert refused("self-test", why, again).shortfalls == (
-            "self-test of lower, struck at tick 0: not armed never undone; bound None",
+            "self-test of lower at tick 0: not armed was never undone (bound in ticks: None)",
         )
     assert refused("self-test", why.replace("lower", "upper")).faults[0].seen == "missed"
     launched = result_of(trial(strikes=(strike("self-test", "lower", 0),)))
@@ -148,7 +148,7 @@ def test_trips_are_counted_by_the_hour_and_misses_beside_them() -> None:
     assert [run.stray_misses for run in calm] == [2, 0]
 
 
-def test_a_trial_is_kept_in_a_file_that_is_there_as_a_whole_or_not_at_all(tmp_path: Path) -> None:
+def test_a_trial_is_saved_atomically(tmp_path: Path) -> None:
     made = trial(SEEN, FLOWS, found(9000, "gap", "upper", "lower.status"))
     path = tmp_path / "trials" / "1.json"
     assert kept(path) is None

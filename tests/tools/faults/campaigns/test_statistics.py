@@ -41,7 +41,7 @@ def judgement(kind: str = "mute", delay: int | None = 5, bound: int = 10, **more
     )
 
 
-def test_what_did_not_strike_is_drawn_and_neither_injected_nor_detected() -> None:
+def test_faults_that_did_not_act_count_only_as_drawn() -> None:
     faults = [
         judgement(),
         judgement(delay=12),
@@ -67,7 +67,7 @@ def test_cycles_are_of_the_task_concerned_and_parts_of_each_bound() -> None:
     assert figures.bound_ticks == {"least": 10, "most": 12}
 
 
-def test_kinds_stand_in_the_order_of_the_table_of_kinds_and_kills_from_outside_last() -> None:
+def test_kinds_are_in_order_and_kills_from_outside_are_last() -> None:
     faults = [judgement(EXTERNAL), judgement("command-nan"), judgement("kill"), judgement("mute")]
     assert list(by_kind(faults, TICK_NS)) == ["kill", "mute", "command-nan", EXTERNAL]
 
@@ -79,7 +79,7 @@ def test_a_death_is_measured_in_time_where_time_is_its_bound() -> None:
     assert judgement(delay=None, bound=2).part_of_bound is None
 
 
-def test_bounds_of_a_share_are_wilsons() -> None:
+def test_the_bounds_of_a_share_follow_wilson() -> None:
     # As in any table of them.
     assert wilson(100, 100) == (0.963007, 1.0)
     assert wilson(5, 10) == (0.236593, 0.763407)
@@ -87,14 +87,14 @@ def test_bounds_of_a_share_are_wilsons() -> None:
     assert wilson(0, 0) is None
 
 
-def test_a_rate_stays_below_what_so_few_events_leave_possible() -> None:
+def test_a_rate_has_an_upper_bound_even_without_events() -> None:
     # Three in as much time as there was, with 95 %, is what none seen permits.
     assert rate(0, 3600.0) == EventRate(0.0, 2.996)
     assert rate(2, 7200.0) == EventRate(1.0, 3.148)
     assert rate(0, 0.0) is None
 
 
-def test_a_curve_goes_from_small_to_large_and_keeps_what_was_not_seen() -> None:
+def test_a_curve_is_sorted_by_size_and_includes_undetected_faults() -> None:
     faults = [
         judgement("sensor-bias", size=0.1),
         judgement("sensor-bias", size=0.001, delay=None),

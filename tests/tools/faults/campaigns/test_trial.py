@@ -69,7 +69,7 @@ def test_a_board_that_is_not_running_is_killed_as_soon_as_it_is(
 
 
 @pytest.mark.slow
-def test_a_trial_has_what_its_judgement_needs(small: Path, rack_name: str) -> None:
+def test_a_trial_contains_everything_for_its_judgement(small: Path, rack_name: str) -> None:
     config = load(small)
     fault = {"kind": "mute", "board": "lower", "tick": 40, "for": "50ms"}
     plan = Plan(3, "faults", lockstep=True, faults=(fault,))

@@ -68,12 +68,12 @@ def test_a_trial_that_cannot_be_made_ends_the_campaign_with_its_reason(
     bad = job(tmp_path, 7, faults=({"kind": "hang", "board": "nobody", "tick": 3},))
     with (
         Workers(config) as workers,
-        pytest.raises(Failure, match=r"^trial 7: ConfigError: .*nobody"),
+        pytest.raises(Failure, match=r"^trial 7 failed: ConfigError: .*nobody"),
     ):
         list(workers.run([bad], alone=False))
 
 
-def test_after_a_signal_nothing_is_begun(
+def test_no_trial_begins_after_a_signal(
     config: RackConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(INTERRUPT, "number", 2)
