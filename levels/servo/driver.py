@@ -1,16 +1,22 @@
-"""The part of a level that drives an arm, whatever it drives it to: sense, decide, drive or brake,
-report.
+"""The part of a level that drives an arm, whatever motion it is driven to follow.
+
+A cycle has three phases:
+
+1. `ArmDriver._watch` checks what the arm senses, and decides how to react. `Takeover` handles the
+   start of the board and arms that are not enabled.
+2. `ArmDriver._drive` drives the arm, or `ArmDriver.brake` brakes it.
+3. `ArmReport` fills the status and the state.
 """
 
 from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import ClassVar, NamedTuple
+from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 
-from rack.backplane.message import Message, State
 from rack.backplane.watch.alarms import BY_DEMAND, Alarm
 from rack.levels import compiled
 from rack.levels.algebra import Array
@@ -32,25 +38,16 @@ from rack.levels.robot.cell import cell_of, sensed_by
 from rack.levels.robot.dynamics import Payload, Terms
 from rack.levels.servo import actuator_monitor, sensor_monitor
 from rack.levels.servo.actuator_monitor import ActuatorMonitor
+from rack.levels.servo.arm_report import ArmReport, SetPointStatus
 from rack.levels.servo.control import ArmParams, SetPointLaw
 from rack.levels.servo.curves import Motion
-from rack.levels.servo.enabling import Enabling
+from rack.levels.servo.enabling import Enabling, Takeover
 from rack.levels.servo.sensor_monitor import SensorMonitor
 from rack.levels.servo.stopping import Cause, Reaction, Stopping
 from rack.levels.tables import read_params
 
 SCENES = Output(Scene, cycles=8)
 """At 400 Hz, a scene for every cycle of the levels that read it."""
-
-
-class Course(NamedTuple):
-    """What a status says of set points."""
-
-    command: int
-    holding: bool
-    stopped: bool
-    cut: int  # cycles in which the level itself cut a set point or a torque
-    kept: str  # why the arm does not follow its set points
 
 
 class ArmDriver(Executor):
@@ -102,12 +99,8 @@ class ArmDriver(Executor):
             (2, len(cell.home))
         )  # the motion wanted in the last cycle begins with: rad, rad/s
         self._wanted[0] = cell.home
-        # Views of what changes in every cycle, in status and state.
-        self._numbers: tuple[Array, Array, Array] | None = None
-        self._shown: tuple[object, ...] = ()  # what seldom changes, in the last status
-        self._started = False  # the first cycle has begun
-        self._adopted = False  # the arm is enabled, and its pose then was taken over
-        self.abandoned = False  # set points were abandoned in the last cycle: the arm was braked
+        self.takeover = Takeover(self.arm, self.sensors, self.stopping, self.enabling)
+        self.abandoned = True  # set points were abandoned in the last cycle: the arm was braked
         self.followed = self.rests_on = (
             0  # serials of the newest command, and of the operator's that it rests on
         )
@@ -127,24 +120,23 @@ class ArmDriver(Executor):
         too coarse to guard it.
         """
         robot = context.robot
-        given = context.params.get("arm")
-        if given is not None and not find_arm(given).keeps_limits:
-            kind = find_arm(given)
+        reference = read_params(cls.params, context.params).arm
+        kind = find_arm(reference)
+        if not kind.keeps_limits:
             cell = sensed_by(cell_of(context), robot, kind.sensors)
             if why := kind.misfit(cell, robot.bring_up or 1.0):
-                yield "params.arm", given, why
+                yield "params.arm", reference, why
         if robot.hand is not None:
             yield (
                 "executor",
                 cls.__name__,
                 "it drives an arm with motors; [robot.hand] is a hand of tendons",
             )
-        interface = context.robot.interface
-        reference = read_params(cls.params, context.params).arm
+        interface = robot.interface
         if interface != "torque" and not cls.gives_set_points:
             why = f'it gives torques; [robot] interface is "{interface}"'
             yield "executor", cls.__name__, why
-        elif not find_arm(reference).takes(interface):
+        elif not kind.takes(interface):
             way = "drive" if interface == "torque" else "follow"
             why = f'no `{way}` of the class takes [robot] interface "{interface}"'
             yield "params.arm", reference, why
@@ -187,20 +179,14 @@ class ArmDriver(Executor):
         """Whether the gripper holds a part."""
 
     @abstractmethod
-    def course(self, reaction: Reaction) -> Course:
+    def course(self, reaction: Reaction) -> SetPointStatus:
         """Return what the status says of set points."""
 
-    @property
-    def has_work(self) -> bool:
-        """Whether the level has work from which it can be kept. Default: once there was a
-        command.
-        """
-        return self.followed > 0
-
-    @property
-    def note(self) -> str:
-        """What the status says while there is nothing worse to say. Default: nothing."""
-        return ""
+    @cached_property
+    def _report(self) -> ArmReport:
+        """Report into the messages, which the board places after the constructor has returned."""
+        slow = self.enabling.slow
+        return ArmReport(self.status, self.state, self.arm, self.sensors, self.stopping, slow)
 
     def obey(self, command: OperatorCommand) -> str:
         """Obey one of `rack.levels.operator.DRIVES`; return why not, empty: it does."""
@@ -224,19 +210,58 @@ class ArmDriver(Executor):
         """
 
     def process(self, tick: int) -> None:
-        """Advance the arm to `tick`, sense, drive or brake, report."""
-        missed = self._catch_up(self.before, tick)
+        """Advance the arm to `tick`, sense, drive or brake, and report."""
+        missed = self._advance(tick)
         self.take_messages()
         sensed = self._link.sense()
-        sensors = self.sensors
+        reaction = self._watch(sensed, missed, tick)
+        if reaction is Reaction.BRAKE:
+            self.brake()
+        elif self.sensors.fresh:
+            self._drive(sensed, reaction, missed, tick)
+        else:
+            self.motors.drop()  # without a new sample the arm keeps its last torque
+        self.arm.brake_cause = BY_DEMAND if self.demand else self.stopping.cause
+        self.motors.torque[:] = self.arm.torque
+        self._report.write_numbers(sensed, self._wanted)
+        self._report.write_fields(self.course(reaction), self.demand, self.part)
+        self.orders.report(self.status, self.rests_on)
+        self.arm.save(self.state)
+        self.stopping.remember(self.state)
+        if SCENES.is_due(tick, self.context.every, self.context.phase):
+            self.arm.look(self.scene)
+
+    def _advance(self, tick: int) -> bool:
+        """Advance the arm to `tick`, in the first cycle after taking it over.
+
+        Returns:
+            Whether cycles were missed since the last one.
+        """
+        begins = not self.takeover.is_started
+        if begins and self.takeover.start(self.before):
+            self.started()
+        ticks = tick - self.arm.tick
+        self.arm.step(ticks)
+        self.arm.report_waiting()
+        if begins or ticks == self.context.every:
+            return False
+        self.motors.drop()
+        return True
+
+    def _watch(self, sensed: Sensed, missed: bool, tick: int) -> Reaction:
+        """Check the sample, contacts, limits and drives; return the reaction of this cycle."""
         contact = self.arm.contact
-        if self._is_judged(sensed, tick):
+        takeover = self.takeover
+        was_complete = takeover.is_complete
+        if takeover.adopt(sensed, tick):
             wanted = None if missed or self.abandoned else self._wanted
-            sensors.look(sensed, tick, wanted, contact is not None)
+            self.sensors.look(sensed, tick, wanted, contact is not None)
+        if takeover.is_complete and not was_complete:
+            self.adopted()
         if contact is not None:
             blow = Cause(Error.TOUCHED, f"unintended contact: {self.arm.named(contact)}")
             self.stopping.stop_for(blow, Finding(Alarm.COLLISION, *contact), tick)
-        if self._adopted and self.arm.exceeded is not None:
+        if takeover.is_complete and self.arm.exceeded is not None:
             finding, text = self.arm.exceeded
             cause = Cause(Error.LIMIT, text, finding.subject, finding.value)
             self.stopping.stop_for(cause, finding, tick)
@@ -244,64 +269,9 @@ class ArmDriver(Executor):
         if serial := self.enabling.arrived():
             self.orders.drives_done(serial)
         if self.enabling.is_enabled:
-            reaction = self.stopping.decide(self.demand, sensors, tick)
-        else:
-            error = Error.DRIVES if self.arm.state is DriveState.FAULT else Error.DISABLED
-            reaction = self.stopping.wait(error, self.enabling.reason, tick)
-        if reaction is Reaction.BRAKE:
-            self.brake()
-        elif sensors.fresh:
-            self._drive(sensed, reaction, missed, tick)
-        else:
-            self.motors.drop()  # without a new sample the arm keeps its last torque
-        self.arm.brake_cause = BY_DEMAND if self.demand else self.stopping.cause
-        self._report(sensed, reaction)
-        self.orders.report(self.status, self.rests_on)
-        self.arm.save(self.state)
-        self.stopping.remember(self.state)
-        if SCENES.is_due(tick, self.context.every, self.context.phase):
-            self.arm.look(self.scene)
-
-    def _catch_up(self, before: Reading[ArmState], tick: int) -> bool:
-        """Advance the arm to `tick`; return whether cycles were missed. A restarted board first
-        restores the arm.
-        """
-        if not self._started:
-            state = before.message if before.is_there else None
-            self._start(state, tick)
-            return False
-        ticks = tick - self.arm.tick
-        self.arm.step(ticks)
-        self.arm.report_waiting()
-        if ticks == self.context.every:
-            return False
-        self.motors.drop()
-        return True
-
-    def _is_judged(self, sensed: Sensed, tick: int) -> bool:
-        """Return whether this sample can be judged: until the arm is enabled, it only says where
-        the arm is, and may be missing.
-        """
-        is_enabled = self.enabling.is_enabled
-        if self._adopted and is_enabled:
-            return True
-        is_adopted = self.sensors.adopt(sensed, tick)
-        self._adopted = is_adopted and is_enabled
-        if self._adopted:
-            self.adopted()
-        return is_adopted or is_enabled
-
-    def _start(self, before: ArmState | None, tick: int) -> None:
-        self.enabling.start(before is not None)
-        if before is not None:
-            self.arm.restore(before)
-            self.sensors.recall(before)
-            self.stopping.recall(before)
-            self.started()
-            self._adopted = self.enabling.is_enabled
-        self.arm.step(tick - self.arm.tick)
-        self.arm.report_waiting()
-        self._started = self.abandoned = True
+            return self.stopping.decide(self.demand, self.sensors, tick)
+        error = Error.DRIVES if self.arm.state is DriveState.FAULT else Error.DISABLED
+        return self.stopping.wait(error, self.enabling.reason, tick)
 
     def brake(self) -> None:
         """Brake, and abandon the set points."""
@@ -339,86 +309,3 @@ class ArmDriver(Executor):
         self.abandoned = False
         self.stopping.refused = None
         return self.motors.begin()
-
-    def _report(self, sensed: Sensed, reaction: Reaction) -> None:
-        """Fill the status, and the estimate in the state; the steady fields only when they
-        change.
-        """
-        arm = self.arm
-        status = self.status
-        if self._numbers is None:
-            self._numbers = (
-                numbers(status, "position", "target_velocity").reshape(5, -1),
-                numbers(status, "opening", "grip_force"),
-                numbers(self.state, "position", "doubt").reshape(3, -1),
-            )
-        joints, gripper, kept = self._numbers
-        kept[:] = self.sensors.estimate
-        joints[:2] = self.sensors.state
-        joints[2] = self.motors.torque[:] = arm.torque
-        joints[3:] = self._wanted[:2]
-        gripper[:] = sensed.opening, sensed.opening_velocity, arm.grip_force
-        course = self.course(reaction)
-        shown = (
-            course,
-            arm.braked,
-            self.demand,
-            arm.clipped,
-            arm.touches,
-            arm.violations,
-            arm.pushed,
-            self.part,
-            self.stopping.error,
-            arm.fault,
-            self.note,
-        )
-        if shown != self._shown:
-            self._shown = shown
-            self._show(status, course)
-
-    def _show(self, status: DrivenArm, course: Course) -> None:
-        """Fill the steady fields."""
-        arm = self.arm
-        stopping = self.stopping
-        kept = course.kept
-        slowed = self.part < 1.0
-        status.echo = course.command
-        status.holding = course.holding
-        status.stopped = course.stopped
-        status.braked = arm.braked
-        status.demand = self.demand
-        status.clipped = arm.clipped + course.cut
-        status.touches = arm.touches
-        status.violations = arm.violations
-        status.pushed = arm.pushed
-        status.slowed = slowed
-        status.reason = kept
-        if stopping.is_disabled:
-            status.state = State.HOLDING
-            status.error = stopping.cause
-        elif arm.fault:
-            status.state = State.ERROR
-            status.error = Error.SIMULATION
-            status.reason = arm.fault
-        elif stopping.error:
-            status.state = State.ERROR
-            status.error = stopping.error
-        else:
-            resting = State.IDLE if course.holding else State.EXECUTING
-            status.state = State.HOLDING if kept and self.has_work else resting
-            touched = Error.TOUCHED if arm.touches else Error.NONE
-            status.error = Error.LIMIT if arm.violations else touched
-            broken = arm.first_violation if arm.violations else arm.first_touch
-            slow = self.enabling.slow if slowed else ""
-            status.reason = kept or broken or slow or self.note
-
-
-def numbers(message: Message, first: str, last: str) -> Array:
-    """Return a view of the fields from `first` to `last`, which are adjacent numbers, as one
-    array.
-    """
-    fields = message.record.dtype.fields
-    assert fields is not None
-    begin = fields[first][1]
-    end = fields[last][1] + fields[last][0].itemsize
-    return np.frombuffer(message.raw[begin:end])

@@ -5,10 +5,14 @@ what they wait for.
 from __future__ import annotations
 
 from collections.abc import Collection
+from dataclasses import dataclass
 
-from rack.levels.arm import DrivableArm, DriveState
-from rack.levels.level import LevelContext
+from rack.levels.arm import DrivableArm, DriveState, Sensed
+from rack.levels.level import LevelContext, Reading
+from rack.levels.messages import ArmState
 from rack.levels.operator import Operation, OperatorCommand
+from rack.levels.servo.sensor_monitor import SensorMonitor
+from rack.levels.servo.stopping import Stopping
 
 
 class Enabling:
@@ -91,3 +95,45 @@ class Enabling:
         if self._guessed:
             return f"confirm, then remove from robot.guessed, before it is enabled: {self._guessed}"
         return f"disabled; to enable: {self._say} enable"
+
+
+@dataclass
+class Takeover:
+    """Restores an arm after a restart, and adopts its pose while it is not enabled.
+
+    An arm that is not enabled may be moved by hand, and its drives may give no samples. So samples
+    are not checked against earlier ones until the arm is enabled and its pose has been adopted.
+    """
+
+    arm: DrivableArm
+    sensors: SensorMonitor
+    stopping: Stopping
+    enabling: Enabling
+    is_started: bool = False  # the first cycle has begun
+    is_complete: bool = False  # the arm is enabled, and its pose was adopted since
+
+    def start(self, before: Reading[ArmState]) -> bool:
+        """Start in the first cycle; return True if an arm was restored from its last state."""
+        self.is_started = True
+        self.enabling.start(before.is_there)
+        if before.is_there:
+            state = before.message
+            self.arm.restore(state)
+            self.sensors.recall(state)
+            self.stopping.recall(state)
+            self.is_complete = self.enabling.is_enabled
+        return before.is_there
+
+    def adopt(self, sensed: Sensed, tick: int) -> bool:
+        """Adopt the sensed pose unless the takeover is complete.
+
+        Returns:
+            True if the sample of this cycle can be checked: either the arm is enabled, or its pose
+            was just adopted.
+        """
+        is_enabled = self.enabling.is_enabled
+        if self.is_complete and is_enabled:
+            return True
+        is_adopted = self.sensors.adopt(sensed, tick)
+        self.is_complete = is_adopted and is_enabled
+        return is_adopted or is_enabled

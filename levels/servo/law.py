@@ -29,9 +29,10 @@ from rack.levels.messages import ArmState, JointCommand, ServoPlan, ServoStatus
 from rack.levels.operator import DRIVES, Goal, Operation, OperatorCommand
 from rack.levels.robot.dynamics import Payload
 from rack.levels.servo import control, curves, reference
+from rack.levels.servo.arm_report import SetPointStatus
 from rack.levels.servo.control import Grip, LawParams, limit_torques
 from rack.levels.servo.curves import Motion, SensedMotion
-from rack.levels.servo.driver import SCENES, ArmDriver, Course
+from rack.levels.servo.driver import SCENES, ArmDriver
 from rack.levels.servo.modification import misfits_of, names_of
 from rack.levels.servo.modified_law import LawInputs, ModifiedLaw
 from rack.levels.servo.operator_control import OperatorControl
@@ -229,12 +230,7 @@ class ServoLaw(ArmDriver):
         """Whether the gripper holds a part, by the plan."""
         return self._holds
 
-    @property
-    def note(self) -> str:
-        """How the law is modified."""
-        return self._modified.reason
-
-    def course(self, reaction: Reaction) -> Course:
+    def course(self, reaction: Reaction) -> SetPointStatus:
         """Return what the status says of set points."""
         operator = self.operator_control
         stands = operator.stands
@@ -244,4 +240,7 @@ class ServoLaw(ArmDriver):
             kept = operator.reason
         holding = self.abandoned or self.reference.holding
         stopped = self.abandoned or reaction > 0 or stands
-        return Course(self.followed, holding, stopped, cut, kept)
+        note = self._modified.reason
+        return SetPointStatus(
+            self.followed, holding, stopped, cut, kept, has_work=self.followed > 0, note=note
+        )

@@ -89,7 +89,7 @@ class SharingServoExecutor(ServoExecutor):
 
     def process(self, tick: int) -> None:
         """Do the cycle of a servo level, and show the shared objects when it is due."""
-        if not self._started and self.last.is_there:
+        if not self.takeover.is_started and self.last.is_there:
             for body in self._shared.values():
                 body.recall(self.last.message)
         super().process(tick)

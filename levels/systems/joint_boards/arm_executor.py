@@ -16,8 +16,9 @@ from rack.levels.messages import ArmState
 from rack.levels.operator import DRIVES, HOLDABLE, OperatorCommand, Orders
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import Payload
+from rack.levels.servo.arm_report import SetPointStatus, numbers
 from rack.levels.servo.curves import Motion
-from rack.levels.servo.driver import SCENES, ArmDriver, Course, numbers
+from rack.levels.servo.driver import SCENES, ArmDriver
 from rack.levels.servo.reference import ASTRAY_RAD
 from rack.levels.servo.stopping import Reaction
 from rack.levels.systems.joint_boards.messages import ArmStatus, JointTorque
@@ -206,12 +207,7 @@ class ArmExecutor(ArmDriver):
         """Whether the gripper holds a part, by the boards above."""
         return self.payload.mass > 0.0
 
-    @property
-    def has_work(self) -> bool:
-        """Return True: the arm is there to be driven."""
-        return True
-
-    def course(self, reaction: Reaction) -> Course:
+    def course(self, reaction: Reaction) -> SetPointStatus:
         """Return what the status says of the torques from above."""
         held = self.orders.holds
         kept = self.stopping.reason or self._waiting
@@ -219,7 +215,7 @@ class ArmExecutor(ArmDriver):
             kept = HELD
         holding = self.abandoned or not self.joints.moves
         stopped = self.abandoned or reaction > 0 or held
-        return Course(0, holding, stopped, 0, kept)
+        return SetPointStatus(0, holding, stopped, 0, kept, has_work=True)
 
 
 def _by(boards: Sequence[str]) -> str:

@@ -20,7 +20,7 @@ from rack.levels.robot.cell import cell_of
 from rack.levels.servo import curves, reference
 from rack.levels.servo.control import Grip, LoopGains
 from rack.levels.servo.curves import Motion
-from rack.levels.servo.driver import numbers
+from rack.levels.servo.arm_report import numbers
 from rack.levels.servo.modification import ModifiableParams, misfits_of, names_of
 from rack.levels.servo.modified_law import LawInputs, ModifiedLaw
 from rack.levels.servo.operator_control import OperatorControl
