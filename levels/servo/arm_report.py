@@ -17,11 +17,11 @@ from rack.levels.servo.stopping import Stopping
 
 
 class SetPointStatus(NamedTuple):
-    """How a level follows its set points in one cycle."""
+    """Report of a level on its set points in one cycle."""
 
     command: int  # id of the newest command
     holding: bool  # no set point is fresh
-    stopped: bool  # the arm does not follow set points
+    stopped: bool  # the arm does not follow its set points
     cut: int  # cycles so far in which the level itself cut a set point or a torque
     reason: str  # why the arm does not follow its set points, or empty
     has_work: bool  # there is work from which `reason` keeps the level

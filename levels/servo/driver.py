@@ -2,10 +2,10 @@
 
 A cycle has three phases:
 
-1. `ArmDriver._watch` checks what the arm senses, and decides how to react. `Takeover` handles the
-   start of the board and arms that are not enabled.
-2. `ArmDriver._drive` drives the arm, or `ArmDriver.brake` brakes it.
-3. `ArmReport` fills the status and the state.
+- Check: `ArmDriver._check_arm` checks the samples of the sensors, and decides how to react. Before
+  that, `Takeover` takes over the arm at the start of the board and after the drives are enabled.
+- Drive: `ArmDriver._drive_arm` drives the arm, or `ArmDriver.brake_arm` brakes it.
+- Report: `ArmReport` fills the status and the state.
 """
 
 from __future__ import annotations
@@ -47,35 +47,41 @@ from rack.levels.servo.stopping import Cause, Reaction, Stopping
 from rack.levels.tables import read_params
 
 SCENES = Output(Scene, cycles=8)
-"""At 400 Hz, a scene for every cycle of the levels that read it."""
+"""A scene in every eighth cycle: at 400 Hz, one for each cycle of the levels that read it."""
 
 
 class ArmDriver(Executor):
-    """Drives an arm and advances its time; subclasses give the motion wanted, and the torques for
-    it.
+    """Drives an arm and advances its time. Subclasses give the motion and the torques for it.
 
-    A cycle first advances the arm by the ticks since the last one: its time is the clock's, even if
-    cycles were missed. Safety comes first: on a demand, and while sensors or motors are at fault,
-    the arm holds, stops or is braked; afterwards motion resumes from where it is.
+    A cycle first advances the arm by the ticks since the last one, so that its time equals the
+    clock even if cycles were missed. Safety comes first: on a demand of the rack, and while sensors
+    or motors are at fault, the arm holds, stops or is braked. Afterwards motion resumes from where
+    it is.
 
     A subclass reads its last state as "before", and writes "status", "state" and "scene".
+
+    Attributes:
+        followed: Id of the newest command.
+        rests_on: Serial of the operator's command that it is based on.
+        abandoned: The arm was braked in the last cycle, so its set points were abandoned.
+        speed_scale: Permitted part of full speed, up to 1.
     """
 
     faults = ARM_STEPS
     params: ClassVar[type[ArmParams]] = ArmParams
     settings: ArmParams
     gives_set_points: ClassVar[bool] = False
-    """Whether it can drive an arm by set points, too: its torques are then those predicted."""
+    """True if it can also drive an arm by set points. Its torques are then predictions."""
     ahead: SetPointLaw | None = None
-    """The set points of a cycle, for drives that take them; None: they take torques."""
+    """Computes set points for position or velocity drives. None for torque drives."""
     orders: Orders
-    """The operator's."""
+    """Commands of the operator."""
     before: Reading[ArmState]
     status: DrivenArm
     state: ArmState
     scene: Scene
     terms: Terms
-    """The equation of motion in this cycle."""
+    """Equation of motion in this cycle."""
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
@@ -86,7 +92,7 @@ class ArmDriver(Executor):
         cell = sensed_by(cell_of(context), robot, kind.sensors)
         self.cell = cell
         self.arm: DrivableArm = kind(cell, context.scene, context.clock_ns, every, context.seed)
-        self.part = robot.bring_up or 1.0  # of full speed, until the operator's release
+        self.part = robot.bring_up or 1.0  # reduced until the operator's release
         self._path = self.arm.connect(context.tick_s, self.part, self.acted, lambda: self.holds)
         self._link: Link = self._path.sound
         self.sensors = SensorMonitor(cell, params, context.tick_s, every)
@@ -94,16 +100,14 @@ class ArmDriver(Executor):
         self.motors = ActuatorMonitor(cell, params.following, context.period_s, is_reported)
         self.stopping = Stopping(params, context.robot.joints, context.tick_s, every)
         self.enabling = Enabling(self.arm, context)
-        self.sensors.findings = self.stopping.findings = self.findings  # one list, in order of time
-        self._wanted = np.zeros(
-            (2, len(cell.home))
-        )  # the motion wanted in the last cycle begins with: rad, rad/s
+        # One list keeps the findings in order of time.
+        self.sensors.findings = self.stopping.findings = self.findings
+        # First rows of the motion wanted in the last cycle: (joints,), rad and rad/s.
+        self._wanted = np.zeros((2, len(cell.home)))
         self._wanted[0] = cell.home
         self.takeover = Takeover(self.arm, self.sensors, self.stopping, self.enabling)
-        self.abandoned = True  # set points were abandoned in the last cycle: the arm was braked
-        self.followed = self.rests_on = (
-            0  # serials of the newest command, and of the operator's that it rests on
-        )
+        self.abandoned = True
+        self.followed = self.rests_on = 0
 
     @classmethod
     def preload(cls) -> None:
@@ -116,8 +120,11 @@ class ArmDriver(Executor):
     def misfits(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Misfits:
-        """Yield a hand, whose tendons have a board of another kind, and an arm whose samples are
-        too coarse to guard it.
+        """Yield a robot that is a hand, and an arm that the level cannot drive or guard.
+
+        A hand of tendons has a board of another kind. An arm that needs a guard must have encoders
+        that are fine enough for it. The arm must take the torques or set points that the level
+        gives.
         """
         robot = context.robot
         reference = read_params(cls.params, context.params).arm
@@ -137,59 +144,69 @@ class ArmDriver(Executor):
             why = f'it gives torques; [robot] interface is "{interface}"'
             yield "executor", cls.__name__, why
         elif not kind.takes(interface):
-            way = "drive" if interface == "torque" else "follow"
-            why = f'no `{way}` of the class takes [robot] interface "{interface}"'
+            method = "drive" if interface == "torque" else "follow"
+            why = f'no `{method}` of the class takes [robot] interface "{interface}"'
             yield "params.arm", reference, why
 
     def inject(self, faults: Sequence[Fault]) -> None:
-        """Replace the faults between this level and the arm."""
+        """Replace the faults injected between this level and the arm."""
         self._path.faulty.inject(faults)
         self._link = self._path.faulty if faults else self._path.sound
 
     @abstractmethod
     def take_messages(self) -> None:
-        """Take over what is new."""
+        """Process the new messages of this cycle."""
 
     @abstractmethod
     def next_motion(self, reaction: Reaction, missed: bool, tick: int) -> Motion | None:
-        """Return the motion wanted in this cycle; None: there is none, brake. `missed`: cycles
-        before it were missed.
+        """Return the motion wanted in this cycle, or None to brake.
 
-        After braking (`abandoned`) it begins where the arm is; with a reaction it comes to rest.
+        After braking (`abandoned`) the motion must begin where the arm is. With a reaction it must
+        come to rest.
+
+        Args:
+            reaction: Reaction of this cycle, weaker than BRAKE.
+            missed: Cycles before this one were missed.
+            tick: Tick of the cycle.
         """
 
     def find_terms(self) -> Terms:
-        """Return the equation of motion at the sensed state, with what the gripper holds."""
+        """Return the equation of motion at the sensed state, with the payload."""
         return self.arm.dynamics.terms(self.sensors.position, self.sensors.velocity, self.payload)
 
     @abstractmethod
     def efforts(self, wanted: Motion, sensed: Sensed) -> tuple[Array, float]:
-        """Return torques, (joints,), N m, and grip force, N, for the wanted motion, at the `terms`
-        of the cycle.
+        """Return torques, (joints,), N m, and grip force, N, for the wanted motion.
+
+        They may use `terms`, the equation of motion of this cycle.
         """
 
     @property
     @abstractmethod
     def payload(self) -> Payload | None:
-        """What the gripper holds; None: nothing, or not known."""
+        """Payload in the gripper. None if there is none, or it is not known."""
 
     @property
     @abstractmethod
     def holds(self) -> bool:
-        """Whether the gripper holds a part."""
+        """True if the gripper holds a part."""
 
     @abstractmethod
     def course(self, reaction: Reaction) -> SetPointStatus:
-        """Return what the status says of set points."""
+        """Return how the level follows its set points, for the status."""
 
     @cached_property
     def _report(self) -> ArmReport:
-        """Report into the messages, which the board places after the constructor has returned."""
+        """Writer of status and state.
+
+        It is built in the first cycle, because the board provides the messages after the
+        constructor.
+        """
         slow = self.enabling.slow
         return ArmReport(self.status, self.state, self.arm, self.sensors, self.stopping, slow)
 
     def obey(self, command: OperatorCommand) -> str:
-        """Obey one of `rack.levels.operator.DRIVES`; return why not, empty: it does."""
+        """Obey one of `rack.levels.operator.DRIVES`. Return why not, or an empty text."""
         if command.what != Operation.RELEASE:
             return self.enabling.obey(command)
         self.part = 1.0
@@ -197,20 +214,16 @@ class ArmDriver(Executor):
         return ""
 
     def feel(self, tick: int) -> None:
-        """Sense more than the joints, before it is decided whether the arm stops. Default:
-        nothing.
-        """
+        """Sense more than the joints, before the reaction is decided. The default does nothing."""
 
     def adopted(self) -> None:
-        """React to an arm that has been enabled, wherever it is. Default: nothing."""
+        """React to an arm that was just enabled, wherever it is. The default does nothing."""
 
     def started(self) -> None:
-        """React to the start of a board whose arm was restored from its last state. Default:
-        nothing.
-        """
+        """React to a restart, after the arm was restored. The default does nothing."""
 
     def process(self, tick: int) -> None:
-        """Advance the arm to `tick`, sense, drive or brake, and report."""
+        """Do one cycle: advance the arm to `tick`, check it, drive or brake it, and report."""
         missed = self._advance(tick)
         self.take_messages()
         sensed = self._link.sense()
@@ -220,7 +233,8 @@ class ArmDriver(Executor):
         elif self.sensors.fresh:
             self._drive(sensed, reaction, missed, tick)
         else:
-            self.motors.drop()  # without a new sample the arm keeps its last torque
+            # Without a new sample the arm keeps its last torque.
+            self.motors.drop()
         self.arm.brake_cause = BY_DEMAND if self.demand else self.stopping.cause
         self.motors.torque[:] = self.arm.torque
         self._report.write_numbers(sensed, self._wanted)
@@ -232,24 +246,24 @@ class ArmDriver(Executor):
             self.arm.look(self.scene)
 
     def _advance(self, tick: int) -> bool:
-        """Advance the arm to `tick`, in the first cycle after taking it over.
+        """Advance the arm to `tick`; take it over in the first cycle.
 
         Returns:
-            Whether cycles were missed since the last one.
+            True if cycles were missed since the last one.
         """
-        begins = not self.takeover.is_started
-        if begins and self.takeover.start(self.before):
+        is_first = not self.takeover.is_started
+        if is_first and self.takeover.start(self.before):
             self.started()
         ticks = tick - self.arm.tick
         self.arm.step(ticks)
         self.arm.report_waiting()
-        if begins or ticks == self.context.every:
+        if is_first or ticks == self.context.every:
             return False
         self.motors.drop()
         return True
 
     def _watch(self, sensed: Sensed, missed: bool, tick: int) -> Reaction:
-        """Check the sample, contacts, limits and drives; return the reaction of this cycle."""
+        """Check sample, contacts, limits and drives, and return the reaction of this cycle."""
         contact = self.arm.contact
         takeover = self.takeover
         was_complete = takeover.is_complete
@@ -274,15 +288,16 @@ class ArmDriver(Executor):
         return self.stopping.wait(error, self.enabling.reason, tick)
 
     def brake(self) -> None:
-        """Brake, and abandon the set points."""
+        """Engage the brakes, and abandon the set points."""
         self.arm.brake()
         self.motors.drop()
         self._wanted = self.sensors.state
         self.abandoned = True
 
     def _drive(self, sensed: Sensed, reaction: Reaction, missed: bool, tick: int) -> None:
-        """Do one cycle with torques; brake when a motor fails, a torque is refused or a stop is
-        complete.
+        """Drive the arm for one cycle.
+
+        It is braked instead if a motor fails, a torque is refused, or a stop is complete.
         """
         wanted = self.next_motion(reaction, missed, tick)
         if wanted is None:
@@ -303,7 +318,8 @@ class ArmDriver(Executor):
             target = self.ahead.target(wanted, self.sensors.position, torque)
             refused = self._link.follow(target, grip_force)
         if refused is not None:
-            self.stopping.refuse(refused, tick)  # the arm has engaged its brakes
+            # The arm has engaged its brakes by itself.
+            self.stopping.refuse(refused, tick)
             return self.brake()
         self._wanted = wanted.table
         self.abandoned = False

@@ -1,6 +1,4 @@
-"""Whether the arm is enabled: asks its drives at the start or by an operator's command, and says
-what they wait for.
-"""
+"""Enables an arm at the start or by an operator's command, and takes over its pose."""
 
 from __future__ import annotations
 
@@ -16,34 +14,36 @@ from rack.levels.servo.stopping import Stopping
 
 
 class Enabling:
-    """Follows the states of an arm's drives. Only an enabled arm is driven, and judged.
+    """Follows the states of an arm's drives. Only an enabled arm is driven and judged.
 
-    Whoever enables an arm sees it: after a fault, or after drives took their torque by themselves,
-    it must be enabled again. A restarted board finds the arm as it is, and asks for nothing.
+    Whoever enables an arm must be able to see it. So it must be enabled again after a fault, or
+    after the drives have switched off their torque themselves. A restarted board leaves the drives
+    as they are.
     """
 
     def __init__(self, arm: DrivableArm, context: LevelContext) -> None:
         robot = context.robot
         self._arm = arm
         self._at_start = robot.enable == "at-start" or (robot.enable is None and arm.keeps_limits)
-        self._say = f"rack command {context.rack} {context.board}"
+        self._command = f"rack command {context.rack} {context.board}"
         speed = f"{robot.bring_up or 1.0:.0%} of full speed"
-        self.slow = f"{speed}; to end that: {self._say} release"
+        self.slow = f"{speed}; to end that: {self._command} release"
         self._guessed = "" if arm.keeps_limits else ", ".join(robot.guessed)
-        self._restarted = False  # in the first cycle, in which old commands are read again
-        self._serial = 0  # of the newest command, while drives are on their way; 0: they are not
-        self._disables = False  # of the commands of a cycle, old ones too, the last one that counts
-        self._leaves = False  # its operator has disabled it, as its drives will show
-        self._goal: Collection[DriveState] = ()  # states in which it is done
+        self._restarted = False  # first cycle after a restart, in which old commands are read again
+        self._serial = 0  # serial of the newest command while the drives carry it out, else 0
+        # The last enable or disable command of a cycle, old ones included, is `disable`.
+        self._disables = False
+        self._leaves = False  # an operator has disabled the arm, which its drives may not show yet
+        self._goal: Collection[DriveState] = ()  # states in which the command is done
 
     def start(self, restarted: bool) -> None:
-        """Begin: ask for torque where that is not the operator's to do."""
+        """Enable the arm at the start, unless an operator must do so or the board was restarted."""
         self._restarted = restarted
         if self._at_start and not (restarted or self._guessed):
             self._arm.enable()
 
     def obey(self, command: OperatorCommand) -> str:
-        """Obey one of `rack.levels.operator.DRIVES`; return why not, empty: it does."""
+        """Obey one of `rack.levels.operator.DRIVES`. Return why not, or an empty text."""
         arm = self._arm
         goal: Collection[DriveState] = list(DriveState)
         if command.what in (Operation.ENABLE, Operation.DISABLE):
@@ -67,7 +67,7 @@ class Enabling:
         return ""
 
     def arrived(self) -> int:
-        """Return the command, once, that wanted the drives where they are now; 0: none."""
+        """Return, once, the serial of a command when the drives have carried it out, else 0."""
         self._restarted = False
         if self._disables:
             self._disables = False
@@ -81,12 +81,12 @@ class Enabling:
 
     @property
     def is_enabled(self) -> bool:
-        """Whether the arm may be driven."""
+        """True if the arm may be driven."""
         return self._arm.state is DriveState.ENABLED and not self._leaves
 
     @property
     def reason(self) -> str:
-        """Why the arm is not enabled, and what enables it."""
+        """Why the arm is not enabled, and how to enable it."""
         state = self._arm.state
         if state is DriveState.FAULT:
             return f"drives: {self._arm.fault}; to go on: `reset`, then `enable`"
@@ -94,7 +94,7 @@ class Enabling:
             return "drives are being enabled"
         if self._guessed:
             return f"confirm, then remove from robot.guessed, before it is enabled: {self._guessed}"
-        return f"disabled; to enable: {self._say} enable"
+        return f"disabled; to enable: {self._command} enable"
 
 
 @dataclass
