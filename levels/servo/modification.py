@@ -140,7 +140,9 @@ class ModificationConfig(Table):
         known = [str(hook) for hook in Hook]
         if hook not in known:
             name = reference.partition(":")[2]
-            raise ValueError(f"class '{name}' has the hook {hook!r}; must be {', '.join(known)}")
+            raise ValueError(
+                f"class '{name}' has the hook {hook!r}; must be one of {', '.join(known)}"
+            )
         return reference
 
     @model_validator(mode="after")

@@ -189,7 +189,7 @@ def test_one_in_place_of_the_law_replaces_another() -> None:
     bench.switch("huge", True)
     assert np.max(bench.run(100)) == LIMITS[2]
     tables = {name: {"class": HERE + "Nine", "on": True} for name in ("one", "two")}
-    with pytest.raises(ValueError, match="one, two are on in place of the law; permitted: one"):
+    with pytest.raises(ValueError, match="only one may be on in place of the law, not one, two"):
         ModifiableParams.model_validate({"modifications": tables})
 
 
@@ -261,7 +261,7 @@ def test_a_notch_removes_its_frequency_and_passes_others(
 ) -> None:
     notch, sample, passed = Notch(law_of(frequency=60.0)), sample_of(torque=5.0), []
     with pytest.raises(
-        LevelError, match="frequency = 500 Hz: permitted: below half the law's rate, 500 Hz"
+        LevelError, match="frequency = 500 Hz: must be below half the law's rate, 500 Hz"
     ):
         Notch(law_of(frequency=500.0))
     # It begins without a transient.
@@ -284,11 +284,11 @@ MISTAKES = {
     "half a class": ({"class": HERE + "Unfinished"}, "class 'Unfinished' lacks: modify"),
     "no hook": (
         {"class": HERE + "Hookless"},
-        "class 'Hookless' has the hook None; permitted: before, instead, after",
+        "class 'Hookless' has the hook None; must be one of before, instead, after",
     ),
     "unknown hook": (
         {"class": HERE + "Later"},
-        "class 'Later' has the hook 'later'; permitted: before, instead, after",
+        "class 'Later' has the hook 'later'; must be one of before, instead, after",
     ),
     "params of one without": (
         {"class": HERE + "Half", "params": {"gain": 2.0}},
