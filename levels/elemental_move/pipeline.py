@@ -106,9 +106,9 @@ class PlanStore:
         return end_of(self._by_move[max(paths)]) if paths else None
 
 
-def joins(plan: MovePlan, place: Array) -> bool:
+def joins(plan: MovePlan, position: Array) -> bool:
     """Return True if the path of a `MOVE_PLAN` begins at `position`, (joints,), rad."""
-    return is_same(np.asarray(plan.waypoints[0]), place)
+    return is_same(np.asarray(plan.waypoints[0]), position)
 
 
 def end_of(plan: MovePlan) -> Array:
