@@ -25,7 +25,6 @@ from rack.levels.operator import (
     OperatorCommand,
     Orders,
 )
-from rack.levels.tables import read_params
 
 
 class ElementalMoveExecutor(Executor):
@@ -48,10 +47,10 @@ class ElementalMoveExecutor(Executor):
     command = Output(MoveCommand, rests_on=above)
     commands = HOLDABLE
     params = ElementalMoveParams
+    settings: ElementalMoveParams
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        self._params = read_params(ElementalMoveParams, context.params)
         self._gripper = context.robot.gripper
         self._plans = PlanStore()
         self._orders = Orders(self.commands)
@@ -162,7 +161,7 @@ class ElementalMoveExecutor(Executor):
         )
         if not blocked:
             self._close_request()
-        elif not self._request and self._replans_of_move >= self._params.replans:
+        elif not self._request and self._replans_of_move >= self.settings.replans:
             self._fail(
                 Error.BLOCKED, f"{self._replans_of_move} other paths tried, still {status.reason}"
             )
@@ -224,7 +223,7 @@ class ElementalMoveExecutor(Executor):
         # A status from below is read up to a cycle late, and the status of this level becomes
         # visible another cycle later.
         by_s = float(move["by"])
-        below_s = by_s - 2.0 * self.context.period_s - self._params.answer
+        below_s = by_s - 2.0 * self.context.period_s - self.settings.answer
         segments.add_path(move, plan, below_s if by_s > 0.0 else 0.0)
         return True
 
@@ -234,7 +233,7 @@ class ElementalMoveExecutor(Executor):
             self._waiting_since = tick
         self._reason = refusal.reason
         waited_s = (tick - self._waiting_since) * self.context.tick_s
-        if refusal.error != Error.NO_PATH or waited_s > self._params.patience:
+        if refusal.error != Error.NO_PATH or waited_s > self.settings.patience:
             self._fail(Error(refusal.error), refusal.reason)
 
     def _shut(self, status: PrimitiveStatus, wanted: float | None = None) -> str:
@@ -248,7 +247,7 @@ class ElementalMoveExecutor(Executor):
         if gripper is None or wanted not in (None, gripper.closed):
             return ""
         away = status.opening - gripper.closed
-        if not abs(away) < (self._params.grasp_gap or gripper.still):
+        if not abs(away) < (self.settings.grasp_gap or gripper.still):
             return ""
         # As a part of the travel, because an opening may be a length or an angle.
         part = away / (gripper.open - gripper.closed)

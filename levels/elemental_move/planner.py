@@ -27,7 +27,6 @@ from rack.levels.motion.path import Path
 from rack.levels.planning.moves import Move, Situation, read_window
 from rack.levels.planning.pose import Pose, pose
 from rack.levels.robot.cell import cell_of
-from rack.levels.tables import read_params
 
 ACKNOWLEDGED_CYCLES = 2
 """Cycles until the status of the executor must acknowledge a plan. Otherwise the plan counts as
@@ -77,6 +76,7 @@ class ElementalMovePlanner(Planner):
     world = Input(WorldState, "world.model")
     output = Output(MovePlan)
     params = ElementalMoveParams
+    settings: ElementalMoveParams
 
     @classmethod
     def preload(cls) -> None:
@@ -90,7 +90,6 @@ class ElementalMovePlanner(Planner):
         # OMPL takes time and memory to import, so only racks that plan motions import it.
         from rack.levels.planning.motion_planner import MotionPlanner
 
-        self._params = read_params(ElementalMoveParams, context.params)
         cell = cell_of(context)
         self._motion = MotionPlanner(cell, context.scene, context.seed)
         self._published: list[Published] = []
@@ -123,10 +122,11 @@ class ElementalMovePlanner(Planner):
         # restart.
         world = self.world.message
         held = self.primitive.message.held
-        done = self.status.message.done
         if held < 0:
             grasps = [
-                (m.object, m.tool) for m in self._window if m.verb is Verb.GRASP and m.id > done
+                (m.object, m.tool)
+                for m in self._window
+                if m.verb is Verb.GRASP and m.id > status.done
             ]
             self._grip = next(
                 ((row, grip_of(row, tool, world)) for row, tool in grasps if row is not None), None
@@ -155,7 +155,7 @@ class ElementalMovePlanner(Planner):
         except Refused as refused:
             plan.error = Error(refused.code)
             plan.reason = str(refused)
-            again_at = visible_at + round(self._params.retry / self.context.tick_s)
+            again_at = visible_at + round(self.settings.retry / self.context.tick_s)
             self._refusal = Refusal(
                 job.move.id, job.request, refused.code, self.world.message.revision, again_at
             )

@@ -50,9 +50,9 @@ class InverseKinematics:
         self._cell = cell
         self._seed = seed
         self._pace = 1.0 / cell.limits.velocity
-        limits = cell.limits.position
-        self._inner_low = limits[:, 0] + LIMIT_MARGIN_RAD
-        self._inner_high = limits[:, 1] - LIMIT_MARGIN_RAD
+        low, high = cell.limits.position.T
+        self._inner_low = low + LIMIT_MARGIN_RAD
+        self._inner_high = high - LIMIT_MARGIN_RAD
         self._data = mujoco.MjData(cell.model)
         joints = len(cell.qpos)
         self._jacobian = np.zeros((6, cell.model.nv))
@@ -200,6 +200,5 @@ class InverseKinematics:
 
 def sampling_range(cell: Cell) -> tuple[Array, Array]:
     """Return low and high, (joints,), rad: the limits, or one turn for a joint without limits."""
-    low = cell.limits.position[:, 0]
-    high = cell.limits.position[:, 1]
+    low, high = cell.limits.position.T
     return np.where(np.isfinite(low), low, -np.pi), np.where(np.isfinite(high), high, np.pi)

@@ -161,7 +161,7 @@ class MotionPlanner:
         straight = Path(np.array([start, goal]), np.zeros(2))
         blocked = self.paths.blocked_at(straight, self._with(clearance))
         obstacle = self.checker.why(blocked, clearance) if blocked is not None else ""
-        return f"no path obstacle around {obstacle}" if obstacle else "no path found"
+        return f"no path found around {obstacle}" if obstacle else "no path found"
 
     def _line(self, move: Move, start: Array, goal: Array | None) -> Path:
         """Plan a straight line of the tool, with the arguments of `plan`."""

@@ -12,15 +12,8 @@ from rack.levels.messages import TaskCommand, TaskPlan, Verb
 from rack.levels.planning.collision import CollisionChecker
 from rack.levels.planning.pose import Pose, pose
 
-VERB_NAMES = {
-    Verb.NONE: "rest",
-    Verb.MOVE: "move",
-    Verb.MOVE_JOINTS: "move",
-    Verb.APPROACH: "approach",
-    Verb.GRASP: "grasp",
-    Verb.DEPART: "depart",
-    Verb.RELEASE: "release",
-}
+VERB_NAMES = {verb: verb.name.lower() for verb in Verb}
+VERB_NAMES |= {Verb.NONE: "rest", Verb.MOVE_JOINTS: "move"}
 
 
 class Move(NamedTuple):

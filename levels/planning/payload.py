@@ -131,7 +131,7 @@ class Payloads:
         tool = pose(*site_pose(data, cell.tool))
         data.qpos[address : address + 7] = np.concatenate(tool @ grip)
         mujoco.mj_kinematics(cell.model, data)
-        parts = self._cell.parts(row)
+        parts = cell.parts(row)
         return sum(
             RAY_RANGE_M - self._nearest(parts, RAY_RANGE_M * side, -side)[0] for side in SIDES
         )

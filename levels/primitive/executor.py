@@ -48,7 +48,6 @@ from rack.levels.primitive.tracking import (
     Tracking,
 )
 from rack.levels.robot.cell import cell_of
-from rack.levels.tables import read_params
 
 Work = PathWork | GripperWork
 
@@ -78,10 +77,11 @@ class PrimitiveExecutor(Executor):
     commands = HOLDABLE
     preloads = (collision, paths)
     params = PrimitiveParams
+    settings: PrimitiveParams
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        params = read_params(PrimitiveParams, context.params)
+        params = self.settings
         cell = cell_of(context)
         self._rules = WorkRules(context.robot.joints, cell.limits, params, context.period_s)
         self._guard = Guard(cell, context.scene, params.lookahead, DELAY_CYCLES * context.period_s)
@@ -350,8 +350,7 @@ class PrimitiveExecutor(Executor):
             return ABOVE_LOST
         if command.message.hold:
             return HELD_FROM_ABOVE
-        unplanned = work is not None and work.unplanned_cycles > MAX_UNEXPLAINED_CYCLES
-        if work and unplanned:
+        if work is not None and work.unplanned_cycles > MAX_UNEXPLAINED_CYCLES:
             return f"segment {work.segment.id} waits for its trajectory from the planner"
         return ""
 

@@ -93,7 +93,7 @@ class Guard:
         """
         self._checker.open_gripper(opening)
         row = segment.object if segment.object >= 0 else None
-        self._checker.permit(row, segment.touch and row is not None)
+        self._checker.permit(row, segment.touch)
         self._checker.place(world.position, world.quaternion)
         # Motion may start close to something, but must not get much closer.
         start_clearance = self._checker.room(path.evaluate(0.0).q)

@@ -49,12 +49,9 @@ class PathMotion:
         self.stopping = False
         self._braking = braking
         self._bridging_s = bridging_s
-        self._offset = np.zeros(path.joints)
         self._bridged_s = bridging_s
-        self.set_point = JointSetPoint(
-            path.evaluate(0.0).q.copy(), np.zeros(path.joints), np.zeros(path.joints)
-        )
-        self._scratch = np.zeros(path.joints)
+        self._offset, self._scratch, *moving = np.zeros((4, path.joints))
+        self.set_point = JointSetPoint(path.evaluate(0.0).q.copy(), *moving)
 
     @property
     def resting(self) -> bool:

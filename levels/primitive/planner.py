@@ -13,7 +13,6 @@ from rack.levels.motion.trajectory import Trajectory, make_trajectory
 from rack.levels.primitive.motion_segment import MotionSegment, SegmentFault, read_segment, window
 from rack.levels.primitive.segment_work import PrimitiveParams, WorkRules
 from rack.levels.robot.cell import cell_of
-from rack.levels.tables import read_params
 
 
 class PrimitivePlanner(Planner):
@@ -26,13 +25,13 @@ class PrimitivePlanner(Planner):
     status = Input(PrimitiveStatus, "own.status")
     output = Output(TrajectoryPlan)
     params = PrimitiveParams
+    settings: PrimitiveParams
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         limits = cell_of(context).limits
         self._positions = limits.position
-        params = read_params(PrimitiveParams, context.params)
-        self._rules = WorkRules(context.robot.joints, limits, params, context.period_s)
+        self._rules = WorkRules(context.robot.joints, limits, self.settings, context.period_s)
         self._made = (0, 0.0)
         self._answered_at = 0
 

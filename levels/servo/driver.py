@@ -98,7 +98,7 @@ class ArmDriver(Executor):
         self.sensors = SensorMonitor(cell, params, context.tick_s, every)
         is_reported = cell.interface == "torque" or self.arm.reports_torque
         self.motors = ActuatorMonitor(cell, params.following, context.period_s, is_reported)
-        self.stopping = Stopping(params, context.robot.joints, context.tick_s, every)
+        self.stopping = Stopping(params, robot.joints, context.tick_s, every)
         self.enabling = Enabling(self.arm, context)
         # One list keeps the findings in order of time.
         self.sensors.findings = self.stopping.findings = self.findings
@@ -202,8 +202,8 @@ class ArmDriver(Executor):
         It is built in the first cycle, because the board provides the messages after the
         constructor.
         """
-        slow = self.enabling.slow
-        return ArmReport(self.status, self.state, self.arm, self.sensors, self.stopping, slow)
+        parts = self.arm, self.sensors, self.stopping
+        return ArmReport(self.status, self.state, *parts, self.enabling.slow)
 
     def obey(self, command: OperatorCommand) -> str:
         """Obey one of `rack.levels.operator.DRIVES`. Return why not, or an empty text."""

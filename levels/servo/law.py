@@ -80,7 +80,6 @@ class ServoLaw(ArmDriver):
         self._limits = cell.bounds.torque
         # (joints,), N m: torques of the law after limiting.
         self._torque: Array = np.zeros(len(cell.home))
-        self._shape = self._torque.shape
         self._limit = limit_torques.load()
         self._cut = 0  # cycles in which a limit cut a torque of the law
         self._sensed = SensedMotion(self.sensors.state)
@@ -211,8 +210,8 @@ class ServoLaw(ArmDriver):
         """
         torque = self._torque
         unlimited = self.torques(set_point, sensed)
-        if getattr(unlimited, "shape", None) != self._shape:
-            shapes = f"shape {np.shape(unlimited)}; expected {self._shape}, one for each joint"
+        if getattr(unlimited, "shape", None) != torque.shape:
+            shapes = f"shape {np.shape(unlimited)}; expected {torque.shape}, one for each joint"
             raise LevelError(f"class {type(self).__name__}: torques() returned {shapes}")
         torque[:] = unlimited
         if self._limit(torque, self._limits):

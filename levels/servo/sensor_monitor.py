@@ -324,16 +324,17 @@ class SensorMonitor:
     def _estimate_blind(self, passed_s: float, age: int) -> None:
         """Estimate all joints without a sample; the newest one is `age` ticks old."""
         is_late = self._late >= SILENT_CYCLES
+        is_silent = age >= SILENT_CYCLES * self._every
         if is_late:
             self._ring(Finding(Alarm.SENSOR_LATE, -1, age))
             self.missing = (
                 f"the newest sample is {age} ticks old; permitted by robot.latency_ticks:"
                 f" {self._latency}"
             )
-        elif not self._late and age >= SILENT_CYCLES * self._every:
+        elif is_silent and not self._late:
             self._ring(Finding(Alarm.SENSOR_SILENT, -1, age))
             self.missing = NO_SAMPLES
-        if is_late or age >= SILENT_CYCLES * self._every:
+        if is_late or is_silent:
             self.drivable = False
             self._suspect[:] = True
             self.blamed = -1, float(age), 0.0

@@ -23,9 +23,6 @@ class Reaction(IntEnum):
     BRAKE = 3  # brake at once
 
 
-DEMANDED = {Demand.NONE: Reaction.NONE, Demand.STOP: Reaction.STOP, Demand.BRAKE: Reaction.BRAKE}
-
-
 class Cause(NamedTuple):
     """A fault that keeps the arm from following its set points."""
 
@@ -214,7 +211,7 @@ class Stopping:
         else:
             self.cause = Error.NONE
             self.reason = ""
-        return max(reaction, DEMANDED[demand]) if demand else reaction
+        return max(reaction, Reaction[demand.name]) if demand else reaction
 
     def _wait_for(self, cause: Cause, tick: int) -> None:
         """Set `cause` and `reason`; the reason names the tick at which the fault is latched."""
