@@ -183,6 +183,7 @@ class PathPlanner:
         count = 0
 
         def is_free(scaled: Array) -> bool:
+            """Check scaled configurations, and count the checks."""
             nonlocal count
             index = first_blocked(scaled / self._levers)
             count += min(index + 1, len(scaled))
@@ -320,6 +321,7 @@ def lever_arms(cell: Cell, seed: int) -> Array:
         axes[sample] = data.xaxis
 
     def measure_lever(joint: int) -> float:
+        """Return the lever arm of one joint."""
         if m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE:
             return 1.0
         carried = geoms_of(m, below(m, m.jnt_bodyid[[joint]]))

@@ -103,7 +103,7 @@ class PrimitiveExecutor(Executor):
         self._begun = 0  # serial of the last segment that was begun
         self._position = cell.home.copy()  # (joints,), rad: last position commanded
         self._rest = JointSetPoint(self._position, *np.zeros((2, len(cell.home))))
-        self._tick: int | None = None  # of the last cycle
+        self._tick: int | None = None  # tick of the last cycle
         # The servo was out of step since the last path, so the arm may not be at its end.
         self._displaced = False
 

@@ -24,7 +24,7 @@ class SetPointStatus(NamedTuple):
     stopped: bool  # the arm does not follow its set points
     cut: int  # cycles so far in which the level itself cut a set point or a torque
     reason: str  # why the arm does not follow its set points, or empty
-    has_work: bool  # there is work from which `reason` keeps the level
+    has_work: bool  # the level has work that `reason` keeps it from
     note: str = ""  # shown as the reason while there is no more important one
 
 

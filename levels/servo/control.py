@@ -57,6 +57,7 @@ class ArmParams(Table):
     @field_validator("arm")
     @classmethod
     def _is_an_arm(cls, reference: str) -> str:
+        """Check that the class can be loaded and is an arm."""
         find_arm(reference)
         return reference
 

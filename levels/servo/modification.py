@@ -35,7 +35,7 @@ from rack.levels.tables import Positive, Table, named_class, read_params
 class Hook(StrEnum):
     """Positions of a modification relative to the servo law."""
 
-    BEFORE = "before"  # changes the motion wanted, or the state, as the law sees them
+    BEFORE = "before"  # changes the wanted motion or the state before the law sees it
     INSTEAD = "instead"  # sets the torque in place of the law
     AFTER = "after"  # changes the law's torque
 
@@ -46,10 +46,10 @@ class LawContext(NamedTuple):
     Vectors are (joints,), for all joints of the arm.
     """
 
-    joints: Sequence[str]  # names
-    period_s: float  # from sample to sample, unless cycles are missed
+    joints: Sequence[str]  # names of the joints
+    period_s: float  # time between samples, unless cycles are missed
     torque: Array  # N m: torque limits, which also apply after every modification
-    params: Mapping[str, Any]  # of the modification, as given
+    params: Mapping[str, Any]  # params of the modification in the config
 
 
 class LawSample:
@@ -74,7 +74,7 @@ class LawSample:
     )
 
     def __init__(self, joints: int) -> None:
-        self.tick = 0  # of the sample
+        self.tick = 0  # tick of the sample
         # Inputs of the law. Its rows are the next five vectors, in rad, rad/s, rad/s2, rad, rad/s.
         self.seen: Array = np.zeros((5, joints))
         self.wanted_position, self.wanted_velocity, self.wanted_acceleration = self.seen[:3]
@@ -136,6 +136,7 @@ class ModificationConfig(Table):
     @field_validator("cls")
     @classmethod
     def _has_a_hook(cls, reference: str) -> str:
+        """Check that the class can be loaded and declares a valid hook."""
         hook = getattr(named_class(reference, Modification), "hook", None)
         known = [str(hook) for hook in Hook]
         if hook not in known:
@@ -147,6 +148,7 @@ class ModificationConfig(Table):
 
     @model_validator(mode="after")
     def _fits_its_class(self) -> ModificationConfig:
+        """Check the params against the table that the class declares."""
         kind = self.kind.params
         if kind is None:
             if self.params:
@@ -180,6 +182,7 @@ class ModifiableParams(Table):
     @field_validator("modifications")
     @classmethod
     def _one_instead(cls, entries: dict[str, ModificationConfig]) -> dict[str, ModificationConfig]:
+        """Check that at most one modification replaces the law from the start."""
         active = [
             name for name, entry in entries.items() if entry.on and entry.kind.hook == Hook.INSTEAD
         ]

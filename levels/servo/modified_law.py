@@ -212,6 +212,7 @@ class ModifiedLaw:
         return torque + (1.0 - passed) ** 2 * (1.0 + 2.0 * passed) * self._difference
 
     def _hooked(self, hook: Hook) -> Sequence[Modified]:
+        """Return the active modifications with a hook, in the order of the config."""
         return [state for state in self._in if state.modification.hook == hook]
 
     def _arrange(self) -> None:

@@ -203,7 +203,7 @@ class HybridExecutor(WristLevel):
         # (joints,), rad/s: velocity of the motion, without the part for forces.
         self._moving = np.zeros(len(cell.home))
         self._still = np.zeros(len(cell.home))
-        self._tick: int | None = None  # of the last cycle
+        self._tick: int | None = None  # tick of the last cycle
 
     def process(self, tick: int) -> None:
         """Do one cycle: follow references and forces, and report."""

@@ -124,7 +124,8 @@ class HybridLaw:
         # Wrench fed forward, N, N m, in the world frame. Velocity on the axes of force, m/s, rad/s,
         # in the task frame.
         self._forward, self._forced = self._by_axis
-        self.offset = np.zeros(3)  # (3,), m: of the tool from its place without force control
+        # (3,), m: offset of the tool from its place without force control.
+        self.offset = np.zeros(3)
 
     def begin(self) -> None:
         """Start at rest without a difference from the motion."""

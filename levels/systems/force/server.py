@@ -132,6 +132,7 @@ class ServerWork(RequestWork):
 
     @property
     def _params(self) -> ServerParams:
+        """Parameters of the board."""
         params = self._tools.params
         assert isinstance(params, ServerParams)
         return params
@@ -160,11 +161,12 @@ class ServerWork(RequestWork):
 
     def _begin_anew(self, why: str) -> None:
         """Restart the motion from where the boards below come to rest."""
-        self.agenda.goal = None  # the arm is not there
+        self.agenda.goal = None  # the arm is not at the goal of a request
         self.boards.leave(why)
         self.interrupt()
 
     def _misfit(self, request: MotionRequest) -> str:
+        """Return why a request is impossible, or an empty text."""
         wanted = Wanted.of(request.record)
         frame = wanted.frame
         if request.kind == MotionKind.COMPLY:
@@ -175,6 +177,7 @@ class ServerWork(RequestWork):
         return super()._misfit(request)
 
     def _start(self, request: MotionRequest) -> None:
+        """Start a request: set guards or axes of force, or begin a motion."""
         wanted = Wanted.of(request.record)
         if request.kind == MotionKind.GUARD:
             self.contact.watch(wanted.frame, wanted.guard)
@@ -190,6 +193,7 @@ class ServerWork(RequestWork):
             super()._start(request)
 
     def _is_done(self, current: MotionRequest) -> bool:
+        """Return True if the current request is done. A COMPLY needs settled forces and rest."""
         if current.kind != MotionKind.COMPLY:
             return super()._is_done(current)
         return self.motion.settled and (
@@ -197,6 +201,7 @@ class ServerWork(RequestWork):
         )
 
     def _lasts_s(self, request: MotionRequest) -> float:
+        """Return the expected duration of a request, s."""
         if request.kind == MotionKind.COMPLY and self.contact.complies:
             return self._params.settle
         return super()._lasts_s(request)
@@ -253,6 +258,7 @@ class ForceServer(WristLevel, TrajectoryExecutor):
         return Mode.FORCE if self._work.contact.complies else Mode.MOTION
 
     def _recall(self) -> None:
+        """Continue from the last messages after a restart, including the contact."""
         super()._recall()
         if self.last_compliance.is_there and self.last_status.is_there:
             self._work.contact.recall(self.last_compliance.message)
@@ -263,6 +269,7 @@ class ForceServer(WristLevel, TrajectoryExecutor):
             self._since = self._now
 
     def _follow_boards(self) -> None:
+        """Process the statuses of the boards below, the contact and the client."""
         super()._follow_boards()
         for below in self.boards.values():
             if below.is_there:
@@ -312,6 +319,7 @@ class ForceServer(WristLevel, TrajectoryExecutor):
         self._agenda.reason = f"{silent}: {what}; cancel, then go on"
 
     def _passed_s(self, tick: int) -> float:
+        """Return the time since `tick`, s."""
         return (self._now - tick) * self.context.tick_s
 
     def _show(self, status: ServerStatus) -> None:

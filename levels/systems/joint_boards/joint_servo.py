@@ -193,6 +193,7 @@ class JointServo(Executor):
         status = self._unmodified[3 * joints :]
 
         def compute_unmodified(motion: Motion, state: Array) -> Array:
+            """Return the torques of the unmodified law for a motion at a state."""
             self._servo(*times, state.reshape(-1), motion.table, torque, status)
             return torque[:joints]
 

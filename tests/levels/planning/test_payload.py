@@ -77,7 +77,7 @@ def test_grip_of_a_linkage_follows_from_its_gear(tmp_path: Path) -> None:
     assert holds == pytest.approx(2 * 1.2 / (0.05 * np.cos(np.pi / 6)), rel=0.01)
 
 
-def test_any_move_with_what_is_held_is_weighed_an_operators_goto_too() -> None:
+def test_every_move_with_a_held_object_is_checked_for_its_weight() -> None:
     made = weighing(40.0)
     move = Move(
         1,

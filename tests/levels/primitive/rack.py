@@ -1,5 +1,4 @@
-"""A rack of servo, world model and primitive level in one process; the test commands it in place of
-the level above."""
+"""A rack of servo, world model and primitive level in one process, commanded by the test."""
 
 from __future__ import annotations
 

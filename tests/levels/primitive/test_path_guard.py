@@ -1,4 +1,4 @@
-"""The guard: the arm rests before it touches an obstacle, and continues when the way is clear."""
+"""The path guard: the arm rests before it touches an obstacle, and continues when it is gone."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_arm_rests_before_an_obstacle_that_crosses_touches_it() -> None:
 
 
 @pytest.mark.slow
-def test_blocked_arm_says_when_the_way_is_free_again_and_continues() -> None:
+def test_a_blocked_arm_continues_when_the_obstacle_has_left() -> None:
     rack = PrimitiveRack(CROSSING, motion=crossing(1.4, leaves_at=4.0))
     sweep(rack)
     rack.run(3.0)
@@ -126,7 +126,7 @@ def test_resting_obstacle_anywhere_on_the_path_is_found() -> None:
         assert not watched.clear()
 
 
-def test_obstacle_on_its_way_into_the_path_is_seen_before_it_is_there() -> None:
+def test_an_obstacle_that_moves_into_the_path_is_found_before_it_arrives() -> None:
     watched = Watched(np.array([NEAR, NEAR + SWEEP]))
     watched.watch()
     arrival_s = 0.6 * watched.trajectory.duration

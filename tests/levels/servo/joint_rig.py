@@ -1,4 +1,4 @@
-"""An arm on a board of its own and boards that servo its joints, under a level that swings them."""
+"""A board of an arm and boards that servo its joints, under a level that swings them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SWING_TICKS = 20
 JOINTS = config("puma560")[0].joints
 TOGETHER: Mapping[str, Mapping[str, Any]] = {"servo": {"gripper": True}}
 APART = {f"servo_{joint}": {"joints": [joint], "gripper": joint == JOINTS[-1]} for joint in JOINTS}
-"""Parameters of the boards that servo joints, by name: one for all joints, or one each."""
+"""Parameters of the boards that servo joints, by name: one board for all or one for each."""
 
 
 class JointRig:

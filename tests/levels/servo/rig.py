@@ -23,8 +23,7 @@ PERIOD = 8
 
 
 class Course(NamedTuple):
-    """A smooth move from one place to another, (joints,) rad, from second 0 on: the minimum-jerk
-    one."""
+    """A minimum-jerk motion between two positions, (joints,), rad, that starts at second 0."""
 
     start: Array
     goal: Array
@@ -46,8 +45,10 @@ class Found(NamedTuple):
 
 
 class ServoRig:
-    """Runs executor and planner of the servo level tick by tick; the set points come from a
-    function of time."""
+    """Runs executor and planner of the servo level tick by tick.
+
+    The set points come from a function of time.
+    """
 
     executor: type[ServoLaw] = ServoExecutor
     outside: Mapping[str, type[Message]] = {"primitive.command": JointCommand}

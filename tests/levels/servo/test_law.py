@@ -1,4 +1,4 @@
-"""A servo law of a user's own: one method, and all else is inherited."""
+"""A user's servo law: it defines one method and inherits everything else."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""A trajectory level, hybrid control, a board that servoes joints, and an arm with a pad over a
-table."""
+"""A trajectory level, hybrid control, a board that servoes joints, and an arm with a pad."""
 
 from __future__ import annotations
 

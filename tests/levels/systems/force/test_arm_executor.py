@@ -115,7 +115,7 @@ def pressed(folder: Path, depth: float, seconds: float = 0.4, **arm: Any) -> Pre
     return rig
 
 
-def test_a_contact_within_the_limits_is_measured_and_no_fault(tmp_path: Path) -> None:
+def test_a_contact_within_the_limits_is_measured_and_is_not_a_fault(tmp_path: Path) -> None:
     rig = pressed(tmp_path, 0.002)
     force = rig.wrench.wrench[:3]
     assert -60.0 < force[0] < -10.0

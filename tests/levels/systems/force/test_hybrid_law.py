@@ -49,7 +49,7 @@ def place(cell: Cell, q: Array) -> Array:
     return tool.pose.position
 
 
-def test_the_inverse_gives_the_velocity_wanted_and_stays_finite_at_a_singularity(
+def test_the_inverse_gives_the_wanted_velocity_and_is_finite_at_a_singularity(
     cell: Cell,
 ) -> None:
     tool, twist = ToolKinematics(cell), np.array([0.02, -0.01, 0.03, 0.1, 0.0, -0.1])
@@ -105,7 +105,7 @@ def test_every_joint_keeps_its_acceleration(cell: Cell) -> None:
     assert law.rests
 
 
-def test_without_force_axes_the_motion_is_followed_with_the_difference_as_it_is(cell: Cell) -> None:
+def test_without_force_axes_the_difference_from_the_motion_stays_constant(cell: Cell) -> None:
     law = HybridLaw(cell, HybridGains())
     assert np.array_equal(law.step(resting(cell), None, PERIOD_S, EMPTY).position, cell.home)
     for _ in range(50):
@@ -120,7 +120,7 @@ def test_without_force_axes_the_motion_is_followed_with_the_difference_as_it_is(
     assert np.array_equal(law.step(resting(cell), None, PERIOD_S, EMPTY).position, cell.home)
 
 
-def test_the_force_wanted_is_fed_forward_as_joint_torques(cell: Cell) -> None:
+def test_the_wanted_force_is_fed_forward_as_joint_torques(cell: Cell) -> None:
     law, tool = HybridLaw(cell, HybridGains()), ToolKinematics(cell)
     exact = np.where(Z, 20.0, 0.0)
     for _ in range(300):
