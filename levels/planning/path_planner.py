@@ -168,11 +168,11 @@ class PathPlanner:
     def _search(
         self, ends: Array, first_blocked: FirstBlocked, seed: int, budget: int
     ) -> tuple[Array | None, int]:
-        """Search a is_free polyline in joint space scaled by the lever arms.
+        """Search a free polyline in joint space scaled by the lever arms.
 
         Args:
             ends: Start and goal, (2, joints), rad.
-            first_blocked: Finds the first configuration that is not is_free.
+            first_blocked: Finds the first configuration that is not free.
             seed: Seed of the random numbers.
             budget: Maximum number of checks of the search; the short cuts add a few.
 

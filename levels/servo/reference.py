@@ -186,7 +186,7 @@ class Reference:
             self._advance(self._next, tick)
 
     def _advance(self, set_point: SetPoint, tick: int) -> None:
-        """Begin the curve set_point the set point that waited, once the one before it is due."""
+        """Begin the curve to the waiting set point, once the one before it is due."""
         due, position, velocity = set_point
         self._next = None
         if due <= tick:

@@ -177,7 +177,7 @@ class JointServo(Executor):
         return refusal
 
     def _modify(self, times: tuple[float, float, float], wanted: Motion, tick: int) -> None:
-        """Replace the torques just computed with the torques of the modified compute_unmodified.
+        """Replace the torques just computed with the torques of the modified law.
 
         Args:
             times: Passed part of the interval, time until the torques act, and age of the sample,
