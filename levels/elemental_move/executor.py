@@ -246,12 +246,12 @@ class ElementalMoveExecutor(Executor):
         gripper = self._gripper
         if gripper is None or wanted not in (None, gripper.closed):
             return ""
-        away = status.opening - gripper.closed
-        if not abs(away) < (self.settings.grasp_gap or gripper.still):
+        opening_gap = status.opening - gripper.closed
+        if not abs(opening_gap) < (self.settings.grasp_gap or gripper.still):
             return ""
         # As a part of the travel, because an opening may be a length or an angle.
-        part = away / (gripper.open - gripper.closed)
-        return f"the gripper has closed to {part:.1%} of its way"
+        travel_part = opening_gap / (gripper.open - gripper.closed)
+        return f"the gripper has closed to {travel_part:.1%} of its way"
 
     def _fail(self, error: Error, reason: str) -> None:
         """Set the error of the present window; the first one counts."""

@@ -69,11 +69,11 @@ class PlanStore:
             before = end
         if message.move <= handed_down or not (message.error or joins(message, before)):
             return
-        known = self._by_move.get(message.move)
+        previous = self._by_move.get(message.move)
         stays = (
-            known is not None
-            and not (known.error or message.error)
-            and is_same(end_of(known), end_of(message))
+            previous is not None
+            and not (previous.error or message.error)
+            and is_same(end_of(previous), end_of(message))
         )
         for move in [m for m in self._by_move if m > message.move and not stays]:
             del self._by_move[move]

@@ -229,8 +229,8 @@ class ElementalMovePlanner(Planner):
         for earlier in self._window:
             # A grasp may be reported done only after the object is reported held. It must not count
             # twice.
-            known = earlier.verb is Verb.GRASP and earlier.object == situation.held
-            if done < earlier.id < move.id and not known:
+            is_counted = earlier.verb is Verb.GRASP and earlier.object == situation.held
+            if done < earlier.id < move.id and not is_counted:
                 situation = situation.after(earlier)
         return situation
 
@@ -265,9 +265,9 @@ class ElementalMovePlanner(Planner):
             self._answered = job.request
             self._answer_due = visible_at + ACKNOWLEDGED_CYCLES * self.context.every
         published = Published(job.move, path, visible_at)
-        known = [p.move.id for p in self._published]
-        if job.move.id in known:
-            self._published[known.index(job.move.id)] = published
+        published_ids = [p.move.id for p in self._published]
+        if job.move.id in published_ids:
+            self._published[published_ids.index(job.move.id)] = published
         elif not job.request:
             self._published.append(published)
 

@@ -206,8 +206,8 @@ class CollisionChecker:
         first, second = self._data.contact.geom[worst]
         distance = self._data.contact.dist[worst]
         pair = f"'{geom_name(self._model, first)}' and '{geom_name(self._model, second)}'"
-        least = distance + short[worst]
-        return f"{pair} are {distance * 1e3:.1f} mm apart; valid: {least * 1e3:.1f} mm"
+        required = distance + short[worst]
+        return f"{pair} are {distance * 1e3:.1f} mm apart; valid: {required * 1e3:.1f} mm"
 
     def _shortfalls(self) -> Array:
         """Return by how much each close pair misses its required distance, m.
@@ -258,10 +258,10 @@ class CollisionChecker:
             self._require(touched, supports, to_supports)
             self._require(gripper, supports, self._margin)
 
-    def _require(self, some: Ints, others: Ints, distance: float) -> None:
+    def _require(self, group: Ints, other_group: Ints, distance: float) -> None:
         """Set the required distance, m, of all pairs between two groups of geoms."""
-        self._required[some[:, None], others] = distance
-        self._required[others[:, None], some] = distance
+        self._required[group[:, None], other_group] = distance
+        self._required[other_group[:, None], group] = distance
 
 
 def restricted_to_arm(cell: Cell, clearance: float, margin: float) -> mujoco.MjModel:
@@ -309,28 +309,28 @@ def required_distances(
     model = cell.model
     arm = cell.arm_geoms
     gripper = cell.gripper_geoms
-    first = model.dof_bodyid[cell.dof[0]]
+    first_link = model.dof_bodyid[cell.dof[0]]
     carriers = []
-    body = model.body_parentid[first]
+    body = model.body_parentid[first_link]
     while body > 0:
         carriers.append(body)
         body = model.body_parentid[body]
-    own = np.union1d(arm, np.flatnonzero(np.isin(model.geom_bodyid, carriers)))
+    arm_and_carriers = np.union1d(arm, np.flatnonzero(np.isin(model.geom_bodyid, carriers)))
     kinds = model.geom_contype
     affinity = model.geom_conaffinity
     collide = (kinds[:, None] & affinity[None, :]) | (kinds[None, :] & affinity[:, None]) != 0
     required = np.full((model.ngeom, model.ngeom), ANY_DISTANCE)
     required[arm, :] = required[:, arm] = clearance
-    for some, others in ((arm, own), (own, arm)):
-        pairs = np.ix_(some, others)
+    for group, other_group in ((arm, arm_and_carriers), (arm_and_carriers, arm)):
+        pairs = np.ix_(group, other_group)
         required[pairs] = np.where(collide[pairs], margin, ANY_DISTANCE)
     # Links of a gripper touch at their pins, and the motion of the gripper is not planned.
     required[np.ix_(gripper, gripper)] = ANY_DISTANCE
     data = mujoco.MjData(restricted)
     mujoco.mj_resetDataKeyframe(restricted, data, 0)
     mujoco.mj_fwdPosition(restricted, data)
-    is_own = np.isin(np.arange(model.ngeom), own)
-    is_foot = np.isin(model.body_weldid[model.geom_bodyid], (0, first))
+    is_own = np.isin(np.arange(model.ngeom), arm_and_carriers)
+    is_foot = np.isin(model.body_weldid[model.geom_bodyid], (0, first_link))
     for pair, distance in zip(data.contact.geom, data.contact.dist, strict=True):
         if is_own[pair].all() or is_foot[pair].all():
             one, other = pair

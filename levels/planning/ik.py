@@ -150,18 +150,18 @@ class InverseKinematics:
         start = reference
         for _ in range(1 + restarts):
             q = self.reach(target, start, match_orientation)
-            known = q is None or any(np.all(np.abs(q - other) < SAME_RAD) for other in solutions)
-            idle = idle + 1 if known else 0
-            if q is not None and not known:
+            is_known = q is None or any(np.all(np.abs(q - other) < SAME_RAD) for other in solutions)
+            idle = idle + 1 if is_known else 0
+            if q is not None and not is_known:
                 solutions.append(q)
             if len(solutions) == MAX_SOLUTIONS or (solutions and idle >= MAX_IDLE_STARTS):
                 break
             start = rng.uniform(self._low, self._high)
         return sorted(solutions, key=lambda q: self.time_between(reference, q))
 
-    def time_between(self, one: Array, other: Array) -> float:
+    def time_between(self, start: Array, end: Array) -> float:
         """Return the time that the slowest joint takes at its velocity limit, s."""
-        return float(np.max(np.abs(one - other) * self._pace))
+        return float(np.max(np.abs(start - end) * self._pace))
 
     def _error(self, target: Pose, q: Array) -> Array:
         """Return the error of the tool at `q`, (6,): distance, m, then rotation, rad."""

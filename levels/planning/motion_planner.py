@@ -97,8 +97,8 @@ class MotionPlanner:
             )
             if free_path is None:
                 place = in_metres(self.ik.tool_at(goal))
-                why = self._why_no_path(start, goal, clearance)
-                raise Refused(Error.NO_PATH, f"{VERB_NAMES[move.verb]} to {place}: {why}")
+                reason = self._why_no_path(start, goal, clearance)
+                raise Refused(Error.NO_PATH, f"{VERB_NAMES[move.verb]} to {place}: {reason}")
             path = free_path
         if situation.held is not None and situation.grip is not None:
             along = BlendedPath(*path).sample(LOAD_STEP_RAD)
@@ -126,9 +126,9 @@ class MotionPlanner:
                 raise Refused(Error.UNREACHABLE, f"{where}; {valid}")
             return move.joints
         if move.posture:
-            near = self.ik.nearby(move.tool, move.joints)
-            if near is not None and self.checker.free(near):
-                return near
+            nearest = self.ik.nearby(move.tool, move.joints)
+            if nearest is not None and self.checker.free(nearest):
+                return nearest
         reference = move.joints if move.posture else start
         reachable = self.ik.reachable(move.tool, reference)
         name = VERB_NAMES[move.verb]
@@ -155,9 +155,9 @@ class MotionPlanner:
 
         The reason is a blocked start or goal, or the obstacle on the straight line between them.
         """
-        why = self.checker.why(start, clearance) or self.checker.why(goal, clearance)
-        if why:
-            return why
+        collision_text = self.checker.why(start, clearance) or self.checker.why(goal, clearance)
+        if collision_text:
+            return collision_text
         straight = Path(np.array([start, goal]), np.zeros(2))
         blocked = self.paths.blocked_at(straight, self._with(clearance))
         obstacle = self.checker.why(blocked, clearance) if blocked is not None else ""
@@ -222,13 +222,13 @@ def _stray(ik: InverseKinematics, path: Path, begin: Pose, target: Pose) -> floa
     blended = BlendedPath(*path)
     if blended.length == 0.0:
         return 0.0
-    way = target.position - begin.position
-    length = norm(way)
+    line = target.position - begin.position
+    length = norm(line)
     samples = blended.sample(blended.length / (STRAY_SAMPLES * (len(path.waypoints) - 1)))
-    off = np.array([ik.tool_at(q).position - begin.position for q in samples])
+    deviations = np.array([ik.tool_at(q).position - begin.position for q in samples])
     if length > 0.0:
-        off -= np.outer(mat_vec(off, way) / length**2, way)
-    return float(np.max(np.linalg.norm(off, axis=1)))
+        deviations -= np.outer(mat_vec(deviations, line) / length**2, line)
+    return float(np.max(np.linalg.norm(deviations, axis=1)))
 
 
 def in_metres(tool: Pose) -> str:

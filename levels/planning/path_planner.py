@@ -103,10 +103,10 @@ class PathPlanner:
         # Blends must not overlap: they use up to half of an inner line, and most of the first and
         # the last line.
         lengths = np.linalg.norm(np.diff(waypoints, axis=0), axis=1)
-        room = 0.5 * lengths
-        room[[0, -1]] = END_PART * lengths[[0, -1]] if len(lengths) > 1 else 0.0
+        largest_blends = 0.5 * lengths
+        largest_blends[[0, -1]] = END_PART * lengths[[0, -1]] if len(lengths) > 1 else 0.0
         blend = np.zeros(len(waypoints))
-        blend[1:-1] = np.minimum(room[:-1], room[1:])
+        blend[1:-1] = np.minimum(largest_blends[:-1], largest_blends[1:])
         for corner in range(1, len(waypoints) - 1):
             largest = float(blend[corner])
             blend[corner] = self._free_blend(waypoints, corner, largest, first_blocked)
@@ -115,8 +115,8 @@ class PathPlanner:
     def blocked_at(self, path: Path, first_blocked: FirstBlocked) -> Array | None:
         """Return the first configuration on `path` that is not free, or None."""
         samples = BlendedPath(*path).sample(self.step_rad)
-        found = first_blocked(samples)
-        return samples[found] if found < len(samples) else None
+        index = first_blocked(samples)
+        return samples[index] if index < len(samples) else None
 
     def duration(self, path: Path) -> float:
         """Return the duration of `path`, from rest to rest, s."""
@@ -134,14 +134,14 @@ class PathPlanner:
             searches: Number of paths to find.
         """
         paths: list[Path] = []
-        left = MAX_CHECKS
+        checks_left = MAX_CHECKS
         for k in range(MAX_SEARCHES):
             seed = 1 + (self._seed + attempt * MAX_SEARCHES + k) % MAX_SEED
-            polyline, checks = self._search(ends, first_blocked, seed, left)
-            left -= checks
+            polyline, checks = self._search(ends, first_blocked, seed, checks_left)
+            checks_left -= checks
             if polyline is not None and len(polyline) <= WAYPOINTS:
                 paths.append(self.rounded(polyline, first_blocked))
-            if left <= 0 or len(paths) == searches:
+            if checks_left <= 0 or len(paths) == searches:
                 break
         return paths
 
@@ -282,7 +282,7 @@ def halved(ends: Array, count: int) -> Array:
     # First and last index of each stretch whose middle becomes a point.
     stretches = np.empty((count + 1, 2), dtype=np.int64)
     stretches[1] = 1, count - 1
-    known = 2
+    stretch_count = 2
     for k in range(1, count):
         first, last = stretches[k]
         middle = (first + last) // 2
@@ -290,8 +290,8 @@ def halved(ends: Array, count: int) -> Array:
             places[k, j] = ends[0, j] + (ends[1, j] - ends[0, j]) * (middle / count)
         for half in ((first, middle - 1), (middle + 1, last)):
             if half[0] <= half[1]:
-                stretches[known] = half
-                known += 1
+                stretches[stretch_count] = half
+                stretch_count += 1
     return places
 
 

@@ -68,8 +68,8 @@ class Payloads:
         needed = MIN_GRIP_FACTOR * self._mass(row) * gravity
         holds = self._holding_force(row, grip)
         if holds is not None and holds < needed:
-            why = f"{needed:.1f} N of grip; the gripper holds {holds:.1f} N"
-            raise Refused(Error.OVERLOAD, f"payload {self._named(row)} needs {why}")
+            shortage = f"{needed:.1f} N of grip; the gripper holds {holds:.1f} N"
+            raise Refused(Error.OVERLOAD, f"payload {self._named(row)} needs {shortage}")
 
     def check_motors(self, row: int, grip: Pose, configurations: Array) -> None:
         """Check that the motors can carry an object.
@@ -91,10 +91,10 @@ class Payloads:
             worst = int(np.argmax(load - limit))
             if load[worst] > limit[worst]:
                 joint = self._cell.joints[worst]
-                why = (
+                shortage = (
                     f"{load[worst]:.1f} N m of '{joint}'; its motor carries {limit[worst]:.1f} N m"
                 )
-                raise Refused(Error.OVERLOAD, f"payload {self._named(row)} needs {why}")
+                raise Refused(Error.OVERLOAD, f"payload {self._named(row)} needs {shortage}")
 
     def _mass(self, row: int) -> float:
         """Return the mass of object `row`, kg."""
@@ -115,8 +115,8 @@ class Payloads:
         model = self._cell.model
         gripper = self._cell.gripper
         assert gripper is not None, "there are jaws"
-        most = float(model.actuator_forcerange[gripper.actuator, 1])
-        force = min(most, gripper.stiffness * abs(narrow.opening - gripper.closed))
+        max_force = float(model.actuator_forcerange[gripper.actuator, 1])
+        force = min(max_force, gripper.stiffness * abs(narrow.opening - gripper.closed))
         normal = force * abs(wide.length - narrow.length) / (wide.gap - narrow.gap)
         parts = self._cell.parts(row)
         return normal * sum(
@@ -249,8 +249,8 @@ class FixedJaw:
         Returns:
             The moved pose, or `tool` if the jaw does not meet the object.
         """
-        here = site_pose(self._data, self._cell.tool)
-        relative = here @ tool.inverse() @ object_pose
+        present_tool = site_pose(self._data, self._cell.tool)
+        relative = present_tool @ tool.inverse() @ object_pose
         along = self._side * self._data.site_xmat[self._cell.tool].reshape(3, 3)[:, 1]
         travel = -FARTHEST_M
         for _ in range(STEPS):

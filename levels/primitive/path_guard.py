@@ -73,8 +73,8 @@ class Guard:
             q: Position of the arm, (joints,), rad.
             world: World model that shows the object in the gripper.
         """
-        seen = Pose(world.position[row], world.quaternion[row])
-        self._checker.hold(row, *(self._checker.tool_at(q).inverse() @ seen))
+        object_pose = Pose(world.position[row], world.quaternion[row])
+        self._checker.hold(row, *(self._checker.tool_at(q).inverse() @ object_pose))
 
     def carry_nothing(self) -> None:
         """Carry no object with the tool from now on."""
@@ -212,9 +212,9 @@ class Sight:
             tick: Tick of the cycle.
         """
         model = world.message
-        seen = world.is_there and model.revision > 0
-        self._blind = self._has_bodies and (not seen or tick - model.sensed > self._blind_ticks)
-        if self._waiting is not None and seen and model.sensed >= self._waiting[1]:
+        is_seen = world.is_there and model.revision > 0
+        self._blind = self._has_bodies and (not is_seen or tick - model.sensed > self._blind_ticks)
+        if self._waiting is not None and is_seen and model.sensed >= self._waiting[1]:
             self._guard.carry(self._waiting[0], q, model)
             self._waiting = None
 

@@ -89,14 +89,16 @@ class PathMotion:
             Largest distance of a joint from the path.
         """
         points = self.path.sample(NEAREST_STEP_RAD)
-        away = np.linalg.norm(points - position, axis=1)
-        before = np.append(np.inf, away[:-1])
-        after = np.append(away[1:], np.inf)
-        near = np.flatnonzero(
-            (away <= before) & (away <= after) & (away <= away.min() + NEAREST_STEP_RAD)
+        distances = np.linalg.norm(points - position, axis=1)
+        before = np.append(np.inf, distances[:-1])
+        after = np.append(distances[1:], np.inf)
+        minima = np.flatnonzero(
+            (distances <= before)
+            & (distances <= after)
+            & (distances <= distances.min() + NEAREST_STEP_RAD)
         )
         # `linspace` ends exactly: with rounding beyond the end, no trajectory could begin.
-        places = np.linspace(0.0, self.path.length, len(points))[near]
+        places = np.linspace(0.0, self.path.length, len(points))[minima]
         nearest = np.argmin(np.abs(places - progress * self.path.length))
         return self._rest(float(places[nearest]), position)
 
@@ -138,10 +140,10 @@ class PathMotion:
             self._bridged_s = min(self._bridged_s + duration_s, self._bridging_s)
             u = self._bridged_s / self._bridging_s
             per_s = 1.0 / self._bridging_s
-            left = 1.0 - u**3 * (10.0 + u * (6.0 * u - 15.0))
+            remaining_part = 1.0 - u**3 * (10.0 + u * (6.0 * u - 15.0))
             rate = -30.0 * u**2 * (1.0 - u) ** 2 * per_s
             change = -60.0 * u * (1.0 - u) * (1.0 - 2.0 * u) * per_s**2
-            for value, factor in zip(self.set_point, (left, rate, change), strict=True):
+            for value, factor in zip(self.set_point, (remaining_part, rate, change), strict=True):
                 value += np.multiply(self._offset, factor, out=self._scratch)
         if self.time_s >= self.trajectory.duration:
             self._come_to_rest()

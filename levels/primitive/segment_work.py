@@ -172,9 +172,9 @@ class PathWork:
         self._fresh = False
         self._clear_cycles = 0
         self._quiet = Quiet(self._rules)
-        away = self.motion.rest_near(position, progress)
-        self.astray = self.blocked = away > self._rules.params.astray
-        self.obstacle = f"the arm is {away:.3f} rad off its path"
+        distance = self.motion.rest_near(position, progress)
+        self.astray = self.blocked = distance > self._rules.params.astray
+        self.obstacle = f"the arm is {distance:.3f} rad off its path"
 
     def step(self, cycle: WorkCycle) -> None:
         """Do one cycle: check the path, start or hold the motion, and advance it."""
@@ -198,14 +198,14 @@ class PathWork:
         """
         if not self.motion.finished:
             return False
-        away = np.abs(status.position - self.motion.set_point.position)
-        settled = self._quiet.settled(bool((away < self._rules.params.settled).all()))
+        distances = np.abs(status.position - self.motion.set_point.position)
+        settled = self._quiet.settled(bool((distances < self._rules.params.settled).all()))
         if self._quiet.overdue and not settled:
-            joint = int(away.argmax())
+            joint = int(distances.argmax())
             permitted = self._rules.params.settled
             name = self._rules.joints[joint]
             reason = (
-                f"joint '{name}' rests {away[joint]:.4f} rad from its goal; valid: at most"
+                f"joint '{name}' rests {distances[joint]:.4f} rad from its goal; valid: at most"
                 f" {permitted} rad"
             )
             self.fault = SegmentFault(Error.FOLLOWING, reason)

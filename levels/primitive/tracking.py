@@ -123,13 +123,13 @@ class Straying:
 
     def update(self, servo: DrivenArm) -> None:
         """Process one status. Sets `fault` when a joint has been too far away for too long."""
-        away = np.abs(servo.position - servo.target)
-        if away.max() <= self._permitted_rad:
+        errors = np.abs(servo.position - servo.target)
+        if errors.max() <= self._permitted_rad:
             self.forget()
             return
         self._cycles += 1
-        joint = int(away.argmax())
-        self.place = f"joint '{self._joints[joint]}' is {away[joint]:.4f} rad from its set point"
+        joint = int(errors.argmax())
+        self.place = f"joint '{self._joints[joint]}' is {errors[joint]:.4f} rad from its set point"
         if self._cycles > self._permitted_cycles:
             self.fault = SegmentFault(
                 Error.FOLLOWING, f"{self.place}; valid: at most {self._permitted_rad} rad"

@@ -146,10 +146,10 @@ class ActuatorMonitor:
     def _lacking(self, velocity: Array, holds: bool) -> Finding | None:
         """Observe a motor whose lack of torque explains the difference, until it is certain."""
         motors = self._motors
-        left = motors["left"]
+        residual = motors["left"]
         noise = motors["noise"]
         commanded = np.abs(self.torque)
-        lacks = left * np.sign(self.torque)
+        lacks = residual * np.sign(self.torque)
         explained = (lacks >= -noise) & (lacks <= commanded + noise)
         if not self._pushed and not explained.all():
             self._pushed = True
@@ -158,18 +158,18 @@ class ActuatorMonitor:
         # While a joint turns, its dry friction is known, so any push is visible.
         is_known = motors["most_friction"] - motors["least_friction"] <= noise
         rests = np.count_nonzero(is_known) < MIN_TURNING_JOINTS
-        part = LACKING_PART
+        permitted_share = LACKING_PART
         if self._pushed:
-            part = MAX_CONTACT_PART
+            permitted_share = MAX_CONTACT_PART
         elif rests and holds:
-            part = MAX_RESTING_CONTACT_PART
-        least = np.maximum(part, noise / self._limits)
+            permitted_share = MAX_RESTING_CONTACT_PART
+        min_share = np.maximum(permitted_share, noise / self._limits)
         joint = (
             self._joint
-            if self._cycles and share[self._joint] > least[self._joint]
+            if self._cycles and share[self._joint] > min_share[self._joint]
             else int(share.argmax())
         )
-        if share[joint] <= least[joint]:
+        if share[joint] <= min_share[joint]:
             self._cycles = 0
             return None
         if self._cycles == 0 or joint != self._joint:
@@ -181,7 +181,7 @@ class ActuatorMonitor:
             self._alone = True
         self._cycles += 1
         self._most = max(self._most, abs(commanded[joint] - lacks[joint]))
-        self._alone &= not rests and np.count_nonzero(np.abs(left) > noise) == 1
+        self._alone &= not rests and np.count_nonzero(np.abs(residual) > noise) == 1
         predicted_speed = np.abs(velocity) + 2.0 * np.abs(velocity - motors["earlier_velocity"])
         if (predicted_speed > self._fastest).any() or self._sure(
             joint, commanded[joint], lacks[joint]
@@ -244,25 +244,25 @@ def left_over(
     verdict = EXPLAINED
     for j in range(len(motors)):
         motor = motors[j]
-        left = motor["torque"] - 0.5 * (motor["bias"] + bias[j])
+        residual = motor["torque"] - 0.5 * (motor["bias"] + bias[j])
         noise = motor["exact_noise"]
         for k in range(len(motors)):
-            left -= (inertia_before[j, k] + inertia[j, k]) * (
+            residual -= (inertia_before[j, k] + inertia[j, k]) * (
                 half_rate * (velocity[k] - motors[k]["velocity"])
             )
             noise += abs(inertia[j, k]) * motors[k]["uncertain"]
         before = motor["velocity"]
-        ahead = velocity[j] + motor["friction_s"] * (half_rate * (velocity[j] - before))
-        slowest = min(ahead, before)
-        fastest = max(ahead, before)
-        least = motor["dry"] * math.tanh(slowest / FRICTION_SPEED - TURNING)
-        most = motor["dry"] * math.tanh(fastest / FRICTION_SPEED + TURNING)
-        left -= min(max(left, least), most)
-        motor["left"] = left
+        later_velocity = velocity[j] + motor["friction_s"] * (half_rate * (velocity[j] - before))
+        slowest = min(later_velocity, before)
+        fastest = max(later_velocity, before)
+        min_friction = motor["dry"] * math.tanh(slowest / FRICTION_SPEED - TURNING)
+        max_friction = motor["dry"] * math.tanh(fastest / FRICTION_SPEED + TURNING)
+        residual -= min(max(residual, min_friction), max_friction)
+        motor["left"] = residual
         motor["noise"] = noise
-        motor["least_friction"] = least
-        motor["most_friction"] = most
-        if abs(left) > noise:
+        motor["least_friction"] = min_friction
+        motor["most_friction"] = max_friction
+        if abs(residual) > noise:
             verdict = max(verdict, LEFT_OVER)
         if abs(wanted[0, j] - position[j]) - motor["off"] > following:
             verdict = ASTRAY

@@ -124,12 +124,12 @@ class Bridge(Curve):
         position, velocity = end
         first = motion.velocity * duration_s
         second = velocity * duration_s
-        way = position - motion.position
+        distance = position - motion.position
         super().__init__(
             motion.position,
             first,
-            3.0 * way - 2.0 * first - second,
-            first + second - 2.0 * way,
+            3.0 * distance - 2.0 * first - second,
+            first + second - 2.0 * distance,
             duration_s=duration_s,
         )
 

@@ -141,12 +141,11 @@ class ArmDriver(Executor):
             )
         interface = robot.interface
         if interface != "torque" and not cls.gives_set_points:
-            why = f'it gives torques; [robot] interface is "{interface}"'
-            yield "executor", cls.__name__, why
+            yield "executor", cls.__name__, f'it gives torques; [robot] interface is "{interface}"'
         elif not kind.takes(interface):
             method = "drive" if interface == "torque" else "follow"
-            why = f'no `{method}` of the class takes [robot] interface "{interface}"'
-            yield "params.arm", reference, why
+            text = f'no `{method}` of the class takes [robot] interface "{interface}"'
+            yield "params.arm", reference, text
 
     def inject(self, faults: Sequence[Fault]) -> None:
         """Replace the faults injected between this level and the arm."""

@@ -138,11 +138,11 @@ class ModificationConfig(Table):
     def _has_a_hook(cls, reference: str) -> str:
         """Check that the class can be loaded and declares a valid hook."""
         hook = getattr(named_class(reference, Modification), "hook", None)
-        known = [str(hook) for hook in Hook]
-        if hook not in known:
+        hooks = [str(hook) for hook in Hook]
+        if hook not in hooks:
             name = reference.partition(":")[2]
             raise ValueError(
-                f"class '{name}' has the hook {hook!r}; must be one of {', '.join(known)}"
+                f"class '{name}' has the hook {hook!r}; must be one of {', '.join(hooks)}"
             )
         return reference
 

@@ -67,20 +67,20 @@ class Modified:
             Why the modification failed, or an empty text.
         """
         original = changed.copy()
-        why = ""
+        failure = ""
         try:
             if self.begins:
                 self.begins = False
                 self.modification.begin(sample)
             self.modification.modify(sample)
         except Exception as error:  # a user's code may raise anything
-            why = f"{type(error).__name__}: {error}"
+            failure = f"{type(error).__name__}: {error}"
         else:
             if not np.isfinite(changed).all():
-                why = "its result is not finite"
-        if why:
+                failure = "its result is not finite"
+        if failure:
             changed[:] = original
-        return why
+        return failure
 
 
 class ModifiedLaw:

@@ -89,9 +89,9 @@ def tolerance(cell: Cell) -> Tolerance:
 
     A position is compared with the sample before, so each sample gets half of the tolerance.
     """
-    off = 0.5 * FIT_RAD + cell.encoders.off
-    jitter_s = float(np.min(off / cell.bounds.velocity))
-    return Tolerance(off, cell.encoders.speed_off, jitter_s)
+    position_error = 0.5 * FIT_RAD + cell.encoders.off
+    jitter_s = float(np.min(position_error / cell.bounds.velocity))
+    return Tolerance(position_error, cell.encoders.speed_off, jitter_s)
 
 
 class SensorMonitor:
@@ -221,8 +221,8 @@ class SensorMonitor:
         self._sent = self._everyone if wanted is None else wanted[1] != 0.0
         fitting = joints["fits"]
         if self.faulty:
-            off = joints["position"] - self.position - joints["way"]
-            fitting = fitting | (np.abs(off) <= joints["allowed"] + self.doubt)
+            offset = joints["position"] - self.position - joints["way"]
+            fitting = fitting | (np.abs(offset) <= joints["allowed"] + self.doubt)
         fastest = blow * joints["fastest"] if struck else joints["fastest"]
         self._doubtful(fitting & (np.abs(joints["velocity"]) <= fastest), passed_s)
 
@@ -232,9 +232,9 @@ class SensorMonitor:
         q = joints["position"]
         joints["unchanged"] = q == joints["last_position"]
         if self.doubt.any():
-            off = q - self.position - joints["way"]
-            for joint in np.flatnonzero(np.abs(off) > tolerance):
-                self.findings.append(Finding(Alarm.RE_REFERENCED, int(joint), float(off[joint])))
+            offset = q - self.position - joints["way"]
+            for joint in np.flatnonzero(np.abs(offset) > tolerance):
+                self.findings.append(Finding(Alarm.RE_REFERENCED, int(joint), float(offset[joint])))
             # A sensor that does not change may be stuck, so its joint remains in doubt.
             self.doubt[~joints["unchanged"]] = 0.0
         self.position[:] = q
@@ -258,8 +258,8 @@ class SensorMonitor:
         qd = joints["velocity"]
         last_q = joints["last_position"]
         last_qd = joints["last_velocity"]
-        way = joints["way"]
-        room = joints["allowed"]
+        travel = joints["way"]
+        allowed = joints["allowed"]
         cycles = joints["still_cycles"]
         finite = np.isfinite(q) & np.isfinite(qd)
         inside = (q >= self._low) & (q <= self._high)
@@ -267,12 +267,12 @@ class SensorMonitor:
         frozen = joints["claimed"] > joints["tolerance"]
         still = (cycles >= STILL_CYCLES) & (np.abs(joints["still_way"]) >= joints["unshown"])
         begins = not self.faulty
-        room += passed_s * np.abs(qd - last_qd)
-        steady = np.abs(q - last_q - (0.5 * passed_s) * (qd + last_qd)) <= room
-        off = q - self.position - way
+        allowed += passed_s * np.abs(qd - last_qd)
+        steady = np.abs(q - last_q - (0.5 * passed_s) * (qd + last_qd)) <= allowed
+        offset = q - self.position - travel
         self._name(Alarm.SENSOR_RANGE, ~finite | ~inside, q)
         self._name(Alarm.SENSOR_STUCK, frozen | still, cycles)
-        self._name(Alarm.SENSOR_MODEL, finite & ~fits & ~frozen, off)
+        self._name(Alarm.SENSOR_MODEL, finite & ~fits & ~frozen, offset)
         good = fits & steady & inside & ~still & ~frozen
         self.drivable = bool((np.isfinite(qd) & ~frozen & ~still).all())
         self.doubt[still] += STUCK_RAD
@@ -291,17 +291,17 @@ class SensorMonitor:
             np.maximum(self.doubt, unseen, out=self.doubt, where=unchanged & self._sent)
         cycles[still] = 0
         if not good.all():
-            amount = np.where(np.isfinite(off), np.abs(off), np.inf)
+            amount = np.where(np.isfinite(offset), np.abs(offset), np.inf)
             joint = int(np.where(good, -1.0, amount).argmax())
-            self.blamed = joint, float(q[joint]), float(off[joint])
+            self.blamed = joint, float(q[joint]), float(offset[joint])
         self._suspect |= ~good
         if self._settled(bool(good.all())):
             self._take(joints["tolerance"])
             return
         self._keep_sample()
-        self._estimate(q, qd, way, np.isfinite(qd) & ~frozen, passed_s)
+        self._estimate(q, qd, travel, np.isfinite(qd) & ~frozen, passed_s)
 
-    def _estimate(self, q: Array, qd: Array, way: Array, known: Mask, passed_s: float) -> None:
+    def _estimate(self, q: Array, qd: Array, travel: Array, known: Mask, passed_s: float) -> None:
         """Estimate the suspect joints, and accept the others as sensed.
 
         A suspect joint is estimated from its velocity, or as braked where that is unknown. Its
@@ -310,7 +310,7 @@ class SensorMonitor:
         Args:
             q: Sensed positions, rad.
             qd: Sensed velocities, rad/s.
-            way: Motion since the last sample according to the velocities, rad.
+            travel: Motion since the last sample according to the velocities, rad.
             known: Joints whose velocity is known.
             passed_s: Time since the last sample.
         """
@@ -318,7 +318,7 @@ class SensorMonitor:
         self.doubt[coasting] += 0.5 * passed_s * np.abs(qd - self.velocity)[coasting]
         self._brake(self._suspect & ~known, passed_s)
         np.copyto(self.position, q, where=~self._suspect)
-        np.add(self.position, way, out=self.position, where=coasting)
+        np.add(self.position, travel, out=self.position, where=coasting)
         np.copyto(self.velocity, qd, where=known)
 
     def _estimate_blind(self, passed_s: float, age: int) -> None:
@@ -348,12 +348,12 @@ class SensorMonitor:
         speed = np.abs(self.velocity)
         braking = self._joints["braking"]
         time_s = np.minimum(passed_s, speed / braking)
-        way = (speed - 0.5 * braking * time_s) * time_s * joints
+        travel = (speed - 0.5 * braking * time_s) * time_s * joints
         # The last torque acts until the brakes engage.
         acting = 2.0 * braking * passed_s * self._every * self._tick_s
-        self.position += np.copysign(way, self.velocity)
+        self.position += np.copysign(travel, self.velocity)
         np.maximum(self.doubt, BRAKE_TAIL_S2 * braking, out=self.doubt, where=joints)
-        self.doubt += way + acting * joints * (speed > 0.0)
+        self.doubt += travel + acting * joints * (speed > 0.0)
         slower = np.copysign(np.maximum(speed - braking * time_s, 0.0), self.velocity)
         np.copyto(self.velocity, slower, where=joints)
 
@@ -434,12 +434,12 @@ def check(  # noqa: PLR0913  # flat, as `advance` in levels/arm/substeps.py
         joint["position"] = q
         joint["velocity"] = qd
         change = qd - velocity[j]
-        way = (0.5 * passed_s) * (qd + velocity[j])
+        travel = (0.5 * passed_s) * (qd + velocity[j])
         further = passed_s * (braked_s * joint["braking"] + blow * joint["fastest"])
         velocity_room = passed_s * (abs(change) + joint["velocity_tolerance"])
-        joint["way"] = way
+        joint["way"] = travel
         joint["allowed"] = joint["tolerance"] + velocity_room + further
-        fits = abs(q - position[j] - way) <= joint["allowed"]  # never true for NaN
+        fits = abs(q - position[j] - travel) <= joint["allowed"]  # never true for NaN
         joint["fits"] = fits
         same = q == joint["last_position"]
         if at_rest and change == 0.0 and same and wanted[1, j] != 0.0:

@@ -240,12 +240,12 @@ class Stopping:
 
     def _about_sensors(self, sensors: SensorMonitor) -> Cause:
         """Describe the fault of the sensors as the cause of a stop."""
-        joint, read, off = sensors.blamed
+        joint, read, offset = sensors.blamed
         if joint < 0:
             return Cause(Error.SENSORS, sensors.missing, joint, read)
         text = f"sensor of '{self._joints[joint]}' reads {read:.4g} rad"
-        if off == off:  # NaN if unknown
-            text = f"{text}, off by {off:.3g}"
+        if offset == offset:  # NaN if unknown
+            text = f"{text}, off by {offset:.3g}"
         return Cause(Error.SENSORS, text, joint, read)
 
     def _about_torque(self, refused: Finding) -> Cause:

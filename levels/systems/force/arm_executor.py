@@ -163,8 +163,8 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
         velocity = self._velocity
         assert raw is not None, "the self-test refuses an arm without a sensor"
         acceleration = np.zeros(len(velocity))
-        known = not self.sensors.faulty and (self._exact or not self.abandoned)
-        if known and self._since is not None:
+        is_velocity_known = not self.sensors.faulty and (self._exact or not self.abandoned)
+        if is_velocity_known and self._since is not None:
             acceleration = (velocity - self._before) / (self.context.tick_s * (tick - self._since))
         self.contact.take(raw, self.sensors.state, acceleration)
         self._before[:] = velocity
@@ -185,10 +185,10 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
             text = "contact too strong: the wrist sensor is at the end of its range"
             self._stop(finding, text, tick)
             return
-        for (half, what, unit), most, alarm in zip(HALVES, self._most, ALARMS, strict=True):
+        for (half, name, unit), limit, alarm in zip(HALVES, self._most, ALARMS, strict=True):
             strength = norm(contact.wrench[half])
-            if strength > most:
-                text = f"contact too strong: {what} of {strength:.3g} {unit}; permitted: {most:g}"
+            if strength > limit:
+                text = f"contact too strong: {name} of {strength:.3g} {unit}; permitted: {limit:g}"
                 self._stop(Finding(alarm, -1, strength), text, tick)
                 return
 

@@ -225,7 +225,7 @@ class ForceMotions(Motions):
             changed = ContactConfig(**{**contact.model_dump(), **changes})
         except ValidationError as error:
             first = error.errors()[0]
-            key = ".".join(str(part) for part in first["loc"])
+            key = ".".join(map(str, first["loc"]))
             raise LevelError(
                 f"{call}: {key} = {first['input']!r}: {first['msg'].lower()}"
             ) from error

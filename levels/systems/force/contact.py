@@ -143,10 +143,10 @@ def misfit(frame: Array, vectors: Sequence[Array], most: tuple[float, float]) ->
     if not abs(norm(frame) - 1.0) <= MAX_UNIT_ERROR:
         return f"the task frame's quaternion has length {norm(frame):.3g}; permitted: 1"
     for wrench in vectors:
-        for (half, what, unit), limit in zip(HALVES, most, strict=True):
+        for (half, name, unit), limit in zip(HALVES, most, strict=True):
             if not norm(wrench[half]) <= limit:
                 return (
-                    f"{what} {norm(wrench[half]):g} {unit}; permitted by the arm and its sensor:"
+                    f"{name} {norm(wrench[half]):g} {unit}; permitted by the arm and its sensor:"
                     f" {limit:g}"
                 )
     return ""

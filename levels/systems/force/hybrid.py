@@ -122,12 +122,12 @@ class ComplianceWatch:
 
     def _permitted(self, wanted: Array) -> Array:
         """Return the wanted wrench, reduced to the arm's limits on contacts."""
-        for (half, what, unit), most in zip(HALVES, self._most, strict=True):
+        for (half, name, unit), limit in zip(HALVES, self._most, strict=True):
             size = norm(wanted[half])
-            if size > most:
-                wanted[half] *= most / size
+            if size > limit:
+                wanted[half] *= limit / size
                 text = (
-                    f"{what} of {size:.3g} {unit} is wanted, {most:g} applied: the arm's limit on"
+                    f"{name} of {size:.3g} {unit} is wanted, {limit:g} applied: the arm's limit on"
                     " contacts"
                 )
                 self.reason = self.reason or text

@@ -152,11 +152,11 @@ class HybridLaw:
         qd = motion.velocity
         wanted = np.zeros(len(q)) if task is None else self._velocity(motion, task, passed_s) - qd
         change = wanted - self._speed
-        most = self._limits.acceleration * passed_s
-        part = float((np.abs(change) / most).max())
+        max_change = self._limits.acceleration * passed_s
+        excess = float((np.abs(change) / max_change).max())
         before = self._speed.copy()
-        if part > 1.0:
-            change /= part
+        if excess > 1.0:
+            change /= excess
         self._speed += change
         self._away += (0.5 * passed_s) * (before + self._speed)
         low, high = self._limits.position.T
@@ -175,14 +175,14 @@ class HybridLaw:
         """Return the joint velocities that follow the motion and the wanted force, rad/s."""
         self._there.look(motion.position + self._base, motion.velocity)
         self._here.look(motion.position + self._away, motion.velocity + self._speed)
-        there = self._there.pose
-        here = self._here.pose
+        motion_pose = self._there.pose
+        present_pose = self._here.pose
         turn = np.zeros(3)
         error = np.zeros(AXES)
-        error[:3] = there.position - here.position
+        error[:3] = motion_pose.position - present_pose.position
         self.offset[:] = -error[:3]
-        mujoco.mju_subQuat(turn, there.quaternion, here.quaternion)
-        mujoco.mju_rotVecQuat(error[3:], turn, here.quaternion)
+        mujoco.mju_subQuat(turn, motion_pose.quaternion, present_pose.quaternion)
+        mujoco.mju_rotVecQuat(error[3:], turn, present_pose.quaternion)
         wanted = mat_vec(self._there.jacobian, motion.velocity) + CATCH_UP * error
         twist = turned(task.rotation.T, wanted)
         forced = np.zeros(AXES)

@@ -139,16 +139,16 @@ class ServerWork(RequestWork):
 
     def _judge(self) -> None:
         """Count how long forces have been as wanted. End compliance if they do not settle."""
-        off = self.off()
+        errors = self.off()
         current = self.agenda.current
         params = self._params
         period_s = self._tools.period_s
-        self._on_s = 0.0 if (off > 1.0).any() else self._on_s + period_s
+        self._on_s = 0.0 if (errors > 1.0).any() else self._on_s + period_s
         self._off_s = 0.0 if self._on_s >= params.settle else self._off_s + period_s
         if current is not None and current.kind == MotionKind.COMPLY:
             self.passed_s = self._on_s
         if self._off_s > params.reach:
-            axis = int(off.argmax())
+            axis = int(errors.argmax())
             felt = 0.0 if self.force is None else -self.force.wrench[axis]
             wanted = (
                 f"axis {AXIS_NAMES[axis]} has not settled at {self.contact.wrench[axis]:g}"
@@ -159,10 +159,10 @@ class ServerWork(RequestWork):
             )
             self.release()
 
-    def _begin_anew(self, why: str) -> None:
+    def _begin_anew(self, reason: str) -> None:
         """Restart the motion from where the boards below come to rest."""
         self.agenda.goal = None  # the arm is not at the goal of a request
-        self.boards.leave(why)
+        self.boards.leave(reason)
         self.interrupt()
 
     def _misfit(self, request: MotionRequest) -> str:
@@ -182,8 +182,8 @@ class ServerWork(RequestWork):
         if request.kind == MotionKind.GUARD:
             self.contact.watch(wanted.frame, wanted.guard)
         elif request.kind == MotionKind.COMPLY and wanted.selected.any():
-            usual = np.array([self._params.speed] * 3 + [self._params.turning] * 3)
-            speed = np.where(wanted.speed > 0.0, wanted.speed, usual)
+            default_speed = np.array([self._params.speed] * 3 + [self._params.turning] * 3)
+            speed = np.where(wanted.speed > 0.0, wanted.speed, default_speed)
             self._on_s = self._off_s = 0.0
             if self.contact.comply(wanted._replace(speed=speed)):
                 self._begin_anew("the arm comes to rest: other axes of force")
@@ -311,12 +311,12 @@ class ForceServer(WristLevel, TrajectoryExecutor):
                 work.release()
                 self._enter(Mode.RELEASED, "forces released, the position is held")
 
-    def _enter(self, mode: Mode, what: str) -> None:
-        """Enter a mode without a client; `what` describes it in the reason."""
+    def _enter(self, mode: Mode, description: str) -> None:
+        """Enter a mode without a client; `description` describes it in the reason."""
         self._without = mode
         self._since = self._now
         silent = f"no sign of life from the client for {self.settings.silence:g} s"
-        self._agenda.reason = f"{silent}: {what}; cancel, then go on"
+        self._agenda.reason = f"{silent}: {description}; cancel, then go on"
 
     def _passed_s(self, tick: int) -> float:
         """Return the time since `tick`, s."""

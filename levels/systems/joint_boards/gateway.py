@@ -97,13 +97,13 @@ class JointGateway(Executor):
     def _extrapolate(self, command: JointReference) -> None:
         """Extrapolate the next reference, or give up if too many are missing."""
         newest = self._newest
-        ahead = self._due + self._period - self.latency - newest.due  # ticks
-        if ahead > self._missing * self._period:
+        ahead_ticks = self._due + self._period - self.latency - newest.due  # ticks
+        if ahead_ticks > self._missing * self._period:
             self._due = command.due = 0
             self._frozen = True
             return
         self._due += self._period
-        ahead_s = ahead * self.context.tick_s
+        ahead_s = ahead_ticks * self.context.tick_s
         command.due = self._due
         command.id = newest.id
         command.position[:] = newest.position + ahead_s * newest.velocity
@@ -208,8 +208,7 @@ class NetworkGateway(JointGateway):
         if peer.presence != Presence.THERE or peer.uncertainty < 0.0:
             # Its references could not be followed, so its motion must not begin.
             self.status.stopped = True
-            is_lost = peer.presence == Presence.LOST
-            self.status.reason = LOST if is_lost else NOT_COMPARED
+            self.status.reason = LOST if peer.presence == Presence.LOST else NOT_COMPARED
         elif self._refused:
             self.status.state = State.HOLDING
             self.status.reason = self._refused

@@ -187,7 +187,6 @@ class JointServo(Executor):
         """
         joints = len(self._driven)
         table = self.loads.table
-        part = times[0]
         command, shown_status = self._shown_numbers
         torque = self._unmodified[: 3 * joints]
         status = self._unmodified[3 * joints :]
@@ -197,7 +196,7 @@ class JointServo(Executor):
             self._servo(*times, state.reshape(-1), motion.table, torque, status)
             return torque[:joints]
 
-        inertia, load = table[AT] + part * (table[DUE] - table[AT])
+        inertia, load = table[AT] + times[0] * (table[DUE] - table[AT])
         inputs = LawInputs(wanted, self._sample.reshape(2, joints), inertia, load, tick)
         modified = self._modified.torque(compute_unmodified, inputs)
         np.copyto(command[:joints], modified, where=self._driven)
