@@ -205,7 +205,7 @@ class ArmDriver(Executor):
         return ArmReport(self.status, self.state, *parts, self.enabling.slow)
 
     def obey(self, command: OperatorCommand) -> str:
-        """Obey one of `rack.levels.operator.DRIVES`. Return why not, or an empty text."""
+        """Obey one of `rack.levels.operator.DRIVES`. Return why it is refused, or an empty text."""
         if command.what != Operation.RELEASE:
             return self.enabling.obey(command)
         self.part = 1.0

@@ -43,7 +43,7 @@ class Enabling:
             self._arm.enable()
 
     def obey(self, command: OperatorCommand) -> str:
-        """Obey one of `rack.levels.operator.DRIVES`. Return why not, or an empty text."""
+        """Obey one of `rack.levels.operator.DRIVES`. Return why it is refused, or an empty text."""
         arm = self._arm
         goal: Collection[DriveState] = list(DriveState)
         if command.what in (Operation.ENABLE, Operation.DISABLE):

@@ -169,7 +169,7 @@ class JointServo(Executor):
         operator.orders.report(self.status, self._rests_on)
 
     def _obey(self, command: OperatorCommand) -> str:
-        """Switch a modification, or set a live parameter. Return refusal not, or an empty text."""
+        """Switch a modification or set a parameter. Return why it is refused, or an empty text."""
         if command.what == Operation.MODIFY:
             return self._modified.switch(command.name, command.goal == Goal.ON)
         self.settings, refusal = set_live(self.settings, command.name)

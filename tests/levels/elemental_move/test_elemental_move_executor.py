@@ -22,7 +22,7 @@ PICK = (Verb.MOVE, Verb.APPROACH, Verb.GRASP, Verb.DEPART, Verb.MOVE)
 
 
 class Bench(Lockstep):
-    """The executor between mailboxes that the test writes."""
+    """The executor with mailboxes that the test writes."""
 
     def __init__(self, **params: Any) -> None:
         places = {"above": "task", "below": "primitive"}
@@ -64,7 +64,7 @@ class Bench(Lockstep):
         replan: int = 0,
         error: Error = Error.NONE,
     ) -> None:
-        """Publish a path for a move, from where the one before it ends or `start`, or a refusal."""
+        """Publish a path for a move, from `start` or the end of the path before, or a refusal."""
         plan = self.message("elemental_move.plan")
         plan.move, plan.replan, plan.kind, plan.error = move, replan, SegmentKind.PATH, error
         plan.reason = "something is there" if error else ""

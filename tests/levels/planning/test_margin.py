@@ -70,7 +70,7 @@ def test_a_grasp_leaves_room_for_fingers_that_reach_farther_as_they_close(
 
 
 JAW_M = 0.025
-"""From the tool of `grippers.one_finger` to its jaw, on the side of negative y."""
+"""Distance from the tool of `grippers.one_finger` to its jaw, on the negative y side."""
 
 
 def jaw_of(made: Cell) -> FixedJaw | None:

@@ -22,7 +22,7 @@ BLOCK1, PEG = 0, 2
 
 
 def weighing(kilograms: float) -> Cell:
-    """Return the PUMA's cell with another mass of block1."""
+    """Return the cell of the PUMA with another mass for block1."""
     made = cell("puma560")
     made.model.body_subtreemass[made.bodies[BLOCK1]] = kilograms
     return made
@@ -34,7 +34,7 @@ def situation_of(made: Cell) -> Situation:
 
 
 def grip_of(made: Cell, row: int) -> Pose:
-    """Return how the first grasp of an object holds it."""
+    """Return the grip of the first grasp of an object."""
     at = situation_of(made)
     return next(iter(grasps(made, at, row)))[0].inverse() @ at.object_pose(row)
 

@@ -28,7 +28,7 @@ SWEEP = np.array([2.2, 0.0, 0.0, 0.0, 0.0, 0.0])
 
 
 def crossing(at: float, y: float = 0.0, leaves_at: float | None = None) -> list[MotionConfig]:
-    """The post waits next to the sweep, steps into it at `at`, and may leave again."""
+    """Return a motion of the post: it waits, enters the path of the arm at `at`, and may leave."""
     beside, inside = (0.85, y, 0.8), (0.55, y, 0.8)
     moves = [(0.0, beside, 5.0), (at, inside, 0.25)] + (
         [(leaves_at, beside, 0.25)] if leaves_at else []
@@ -82,7 +82,7 @@ def test_a_blocked_arm_continues_when_the_obstacle_has_left() -> None:
 
 
 class Watched:
-    """A guard over a path of the crossing cell, and the world model that it is shown."""
+    """A guard of a path in the crossing cell, with its world model."""
 
     def __init__(self, waypoints: np.ndarray, held: int = -1) -> None:
         _, scene = arms.config(CROSSING)
@@ -103,7 +103,7 @@ class Watched:
         self.guard.watch(self.segment, self.path, 0.04, self.world)
 
     def clear(self, time_s: float = 0.0, cycles: int = 60) -> bool:
-        """Return whether the way stays clear over `cycles` in which nothing moves."""
+        """Return True if the path stays clear for `cycles` in which nothing moves."""
         answers = [
             self.guard.is_clear(self.path, self.trajectory, time_s, self.world)
             for _ in range(cycles)

@@ -16,7 +16,7 @@ def positions(rack: PrimitiveRack) -> np.ndarray:
 
 
 def first(rack: PrimitiveRack, **wanted: int) -> int:
-    """Return the index of the first status whose fields are as wanted."""
+    """Return the index of the first status with the given fields."""
     return next(
         k
         for k, s in enumerate(rack.seen)
@@ -26,7 +26,7 @@ def first(rack: PrimitiveRack, **wanted: int) -> int:
 
 @pytest.fixture(scope="module")
 def finished() -> PrimitiveRack:
-    """A rack that has done both paths; its tests only look at it."""
+    """A rack that has done both paths. Tests must not change it."""
     rack = PrimitiveRack()
     rack.command(*two_paths(rack))
     assert rack.run_until_done(2)

@@ -54,7 +54,7 @@ def test_a_restarted_executor_keeps_its_grip(died_at_s: float) -> None:
 
 
 def seconds(time_s: float) -> int:
-    """Return that time in ticks."""
+    """Return a time in ticks."""
     return round(time_s * 1e9 / CLOCK_NS)
 
 

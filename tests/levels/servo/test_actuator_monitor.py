@@ -71,7 +71,7 @@ def dashing(name: str, joint: int, side: float, **params: float | str) -> tuple[
 
 
 def found(rig: ServoRig) -> list[int]:
-    """Return the ticks in which a motor was found at fault."""
+    """Return the ticks in which a motor fault was found."""
     return [tick for tick, finding in rig.found if finding.alarm is Alarm.ACTUATOR]
 
 
@@ -144,11 +144,11 @@ CELL = cell("puma560")
 RESTING = np.zeros((2, 6))
 REST = RESTING[0]
 HELD_BY_FRICTION = math.tanh(2.0) * CELL.model.dof_frictionloss[CELL.dof]
-"""Torques that dry friction takes at rest, N m."""
+"""Torques that dry friction absorbs at rest, N m."""
 
 
 class Bench:
-    """An arm that rests in its home, with torques left over as a test says."""
+    """An arm at rest at home, with unexplained torques that the test sets."""
 
     def __init__(self) -> None:
         self.monitor = ActuatorMonitor(CELL, following=0.02, period_s=TICK_S)

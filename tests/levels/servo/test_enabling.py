@@ -27,7 +27,7 @@ AWAY = np.array([0.3, -0.2])
 
 
 class StatefulArm(IdealArm):
-    """Its drives take some ticks to be enabled, and start away from home."""
+    """An arm whose drives take some ticks to be enabled, and which starts away from home."""
 
     ticks = 5
 
@@ -53,7 +53,7 @@ class StatefulArm(IdealArm):
 
 
 class OffArm(IdealArm):
-    """Its drives count from elsewhere."""
+    """An arm whose drives have another zero position."""
 
     def sense(self) -> Sensed:
         sample = super().sense()

@@ -41,7 +41,7 @@ def torque(sampled: int, joint: int, newton_metres: float) -> Message:
 
 
 def joint_torques() -> JointTorques:
-    """Return those of two boards, one as fast as the arm, one of half its rate."""
+    """Return the torques of two boards, one as fast as the arm and one at half its rate."""
     robot, scene = config("puma560")
     pace = {"fast": Pace(1, 1), "slow": Pace(2, 1)}
     return JointTorques(

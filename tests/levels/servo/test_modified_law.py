@@ -44,7 +44,7 @@ class Half(Modification):
 
 
 class Further(Modification):
-    """Wants positions one rad further."""
+    """Moves the wanted positions by one rad."""
 
     hook = Hook.BEFORE
 
@@ -53,7 +53,7 @@ class Further(Modification):
 
 
 class Nine(Modification):
-    """Gives 9 N m in place of the law."""
+    """Sets 9 N m in place of the law."""
 
     hook = Hook.INSTEAD
 
@@ -63,7 +63,7 @@ class Nine(Modification):
 
 
 class Counts(Modification):
-    """Adds the number of its samples since it was put in, N m."""
+    """Adds the number of its samples since it was switched on, N m."""
 
     hook = Hook.AFTER
 
@@ -112,7 +112,7 @@ class SetsNothing(Modification):
 
 
 class Bench:
-    """A law of one number: torque = 3 N m + 10 N m/rad times the position wanted, modified."""
+    """A modified law with torque = 3 N m + 10 N m/rad times the wanted position."""
 
     def __init__(self, **modifications: Mapping[str, Any] | str) -> None:
         tables = {

@@ -22,7 +22,7 @@ OMEGA = 2.0 * math.pi / 1.2
 PATIENCE_TICKS = 120
 WITHIN = {"patience": PATIENCE_TICKS * 0.0025, "retry": 0.05}
 RECOVERS_TICKS = 75
-"""A retry, the good cycles after it, and the rest of the last try."""
+"""Ticks of a retry, the good cycles after it, and the rest of the last try."""
 KINDS = [
     ("sensor-nan", {}, Error.SENSORS),
     ("sensor-stuck", {}, Error.SENSORS),

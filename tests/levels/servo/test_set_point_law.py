@@ -31,7 +31,7 @@ STUCK_AT = 150
 
 
 class StuckServoArm(ServoArm):
-    """From a tick on its drives stay where they are, and say nothing of it."""
+    """An arm whose drives stop following from a tick on, without reporting it."""
 
     def follow(self, target: JointTarget, grip_force: float) -> Finding | None:
         kept = self._rows[0].copy()

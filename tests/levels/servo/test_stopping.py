@@ -18,7 +18,7 @@ BRAKES = (Alarm.BRAKES_CLOSED, Alarm.BRAKES_OPENED)
 ROBOT, SCENE = config("puma560_crossing")
 HOME = np.array(ROBOT.home)
 FOREARM, HAND = (0.35, 1.3), (0.5, 1.1)
-"""x and z, m, at which the post meets them on its way in y."""
+"""x and z, m, at which the post meets these geoms when it moves along y."""
 
 
 def turn(time_s: float) -> tuple[Array, Array]:
@@ -32,7 +32,7 @@ def stand(_: float) -> tuple[Array, Array]:
 
 
 def under_fire(at: tuple[float, float], end_y: float, speed: float) -> ServoRig:
-    """Return an arm towards which the post comes, from second 0.4 on."""
+    """Return an arm towards which the post moves from second 0.4 on."""
     (x, z), begin_y = at, 0.85
     motion = (
         MotionConfig(body="post", at=0.0, to=(x, begin_y, z), speed=50.0),

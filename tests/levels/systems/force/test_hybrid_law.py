@@ -1,4 +1,4 @@
-"""The law of hybrid control alone: its inverse, its limits, and what it leaves unchanged."""
+"""The law of hybrid control alone: its inverse, its limits and its constant difference."""
 
 from __future__ import annotations
 
@@ -32,18 +32,18 @@ def cell(tmp_path: Path) -> Cell:
 
 
 def resting(cell: Cell, away: float = 0.0) -> Motion:
-    """Return rest at home, all joints `away`, rad."""
+    """Return a motion at rest with all joints `away`, rad, from home."""
     return Motion(np.stack((cell.home + away, np.zeros(6), np.zeros(6))))
 
 
 def task(exerted: Array | None, rotation: Array | None = None) -> ForceTask:
-    """Return one that wants 20 N along z at 0.05 m/s at most."""
+    """Return a task with 20 N along z at 0.05 m/s at most."""
     wanted, turned = np.where(Z, 20.0, 0.0), np.eye(3) if rotation is None else rotation
     return ForceTask(turned, Z, wanted, exerted, np.full(6, 0.05))
 
 
 def place(cell: Cell, q: Array) -> Array:
-    """Return the tool's place at `q`, m."""
+    """Return the position of the tool at `q`, m."""
     tool = ToolKinematics(cell)
     tool.look(q, np.zeros(6))
     return tool.pose.position

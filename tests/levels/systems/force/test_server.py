@@ -1,4 +1,4 @@
-"""A server of force and motion as its client and its boards see it."""
+"""A server of force and motion, seen from its client and its boards."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ TICK_S = 0.001
 PERIOD, EVERY, DELAY, MISSING = 10, 2, 2, 5
 LATENCY = DELAY + 2 * EVERY
 SPEED = 0.5
-"""rad/s, of every joint."""
+"""Velocity of every joint, rad/s."""
 BOARDS = ("near", "far")
 SIZES = sizes(cell("puma560"))
 
