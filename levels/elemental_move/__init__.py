@@ -1,6 +1,4 @@
-"""The elemental move level: moves of the tool become collision-free joint paths, planned before
-they are due.
-"""
+"""The elemental move level: plans collision-free joint paths for moves before they are due."""
 
 from rack.levels.elemental_move.executor import ElementalMoveExecutor
 from rack.levels.elemental_move.planner import ElementalMovePlanner

@@ -25,15 +25,14 @@ from rack.levels.operator import (
     OperatorCommand,
     Orders,
 )
-from rack.levels.tables import read_params
 
 
 class ElementalMoveExecutor(Executor):
-    """Hands segments down as soon as they are planned, and requests another path where the arm is
-    blocked.
+    """Hands segments down as soon as they are planned.
 
-    After a restart of its board it continues from its own last messages. The arm is held on
-    its path while the board above is lost, and on `hold` from above or from an operator.
+    Where the arm is blocked, it requests another path. After a restart of its board it continues
+    from its own last messages. The arm is held on its path while the board above is lost, and on
+    `hold` from above or from an operator.
     """
 
     above = Input(TaskCommand, "above.command")
@@ -42,31 +41,31 @@ class ElementalMoveExecutor(Executor):
     last_command = Input(MoveCommand, "own.command")
     last_status = Input(MoveStatus, "own.status")
     operator = Input(OperatorCommand, "own.operator")
-    # The status first: a board killed between the two finds done moves still in its window, and
-    # removes them again.
+    # The status is written first. A board killed between the two finds done moves in its window
+    # after the restart, and removes them again.
     status = Output(MoveStatus, rests_on=below)
     command = Output(MoveCommand, rests_on=above)
     commands = HOLDABLE
     params = ElementalMoveParams
+    settings: ElementalMoveParams
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        self._params = read_params(ElementalMoveParams, context.params)
         self._gripper = context.robot.gripper
         self._plans = PlanStore()
         self._orders = Orders(self.commands)
         self._started = False
-        self._done = 0  # newest move done
-        self._handed_down = 0  # newest move handed down
-        self._request = 0  # open request for another path; 0: none
-        self._replans = 0  # other paths taken, in total
-        self._replans_of_move = 0  # and by the present move
+        self._done = 0  # id of the newest move done
+        self._handed_down = 0  # id of the newest move handed down
+        self._request = 0  # open request for another path, or 0
+        self._replans = 0  # number of other paths taken
+        self._replans_of_move = 0  # number of other paths taken by the present move
         self._waiting_since: int | None = None  # tick of the first refusal of the awaited path
         self._error = Error.NONE
         self._reason = ""
 
     def process(self, tick: int) -> None:
-        """Read command, status and plan; keep the window of segments full."""
+        """Do one cycle: read command, status and plan, and keep the window of segments full."""
         segments = SegmentWindow(self.command)
         if not self._started:
             self._recall(segments)
@@ -96,9 +95,7 @@ class ElementalMoveExecutor(Executor):
         self._answer()
 
     def _recall(self, segments: SegmentWindow) -> None:
-        """Continue from the last command and status in the mailboxes; the stock of plans is
-        lost.
-        """
+        """Continue from the last command and status in the mailboxes. Stored plans are lost."""
         self._started = True
         self.status.end = self.below.message.position
         if self.last_command.is_there and self.last_status.is_there:
@@ -118,7 +115,13 @@ class ElementalMoveExecutor(Executor):
     def _take_window(
         self, command: TaskCommand, status: PrimitiveStatus, segments: SegmentWindow
     ) -> None:
-        """Start anew, once the arm rests, on a window that does not continue the last one."""
+        """Restart on a window that does not continue the last one, once the arm rests.
+
+        Args:
+            command: Command that contains the window.
+            status: Status of the primitive level.
+            segments: Segments handed down, which are withdrawn.
+        """
         first = int(command.moves["id"][0]) if command.count else 0
         if first <= self._handed_down + 1:
             return
@@ -130,7 +133,7 @@ class ElementalMoveExecutor(Executor):
             self._reason = ""
 
     def _check_below(self, status: PrimitiveStatus, segments: SegmentWindow) -> None:
-        """Fail when the level below has failed, or the held object is lost."""
+        """Fail if the level below has failed, or the held object is lost."""
         if status.state == State.ERROR:
             self._fail(Error(status.error), status.reason)
         moving = segments.count and segments.first["kind"] == SegmentKind.PATH
@@ -140,8 +143,14 @@ class ElementalMoveExecutor(Executor):
     def _replan_if_blocked(
         self, status: PrimitiveStatus, segments: SegmentWindow, tick: int
     ) -> None:
-        """Request another path where the arm rests in front of an obstacle; cancel the request when
-        the way is free.
+        """Request another path if the arm rests in front of an obstacle, and use the answer.
+
+        The request is cancelled when the way is free.
+
+        Args:
+            status: Status of the primitive level.
+            segments: Segments handed down.
+            tick: Tick of the cycle.
         """
         blocked = bool(
             segments.count
@@ -152,7 +161,7 @@ class ElementalMoveExecutor(Executor):
         )
         if not blocked:
             self._close_request()
-        elif not self._request and self._replans_of_move >= self._params.replans:
+        elif not self._request and self._replans_of_move >= self.settings.replans:
             self._fail(
                 Error.BLOCKED, f"{self._replans_of_move} other paths tried, still {status.reason}"
             )
@@ -161,7 +170,8 @@ class ElementalMoveExecutor(Executor):
         elif (plan := self._plans.answer(self._request)) is not None:
             if plan.error:
                 self._wait(plan, tick)
-            elif not joins(plan, status.position):  # the arm has moved since
+            elif not joins(plan, status.position):
+                # The arm has moved since the request.
                 self._open_request(tick)
             else:
                 segments.replace_first(plan)
@@ -171,10 +181,11 @@ class ElementalMoveExecutor(Executor):
                 self._replans_of_move += 1
 
     def _open_request(self, tick: int) -> None:
-        # The cycle's number is unique, even across a restart.
+        """Request another path. The cycle's number identifies it, even across a restart."""
         self._request = tick // self.context.every
 
     def _close_request(self) -> None:
+        """Cancel an open request."""
         if self._request:
             self._request = 0
             self._waiting_since = None
@@ -191,6 +202,7 @@ class ElementalMoveExecutor(Executor):
             self._reason = ""
 
     def _hand_down(self, move: Any, segments: SegmentWindow, tick: int) -> bool:
+        """Hand down one move as a segment. Return False if that is not possible yet."""
         if move["verb"] in (Verb.GRASP, Verb.RELEASE):
             gripper = self._gripper
             if gripper is None:
@@ -208,45 +220,48 @@ class ElementalMoveExecutor(Executor):
             if not segments.count:
                 self._wait(plan, tick)
             return False
-        # A status from below waits up to a cycle to be read, and this level's becomes visible
-        # another cycle later.
+        # A status from below is read up to a cycle late, and the status of this level becomes
+        # visible another cycle later.
         by_s = float(move["by"])
-        below_s = by_s - 2.0 * self.context.period_s - self._params.answer
+        below_s = by_s - 2.0 * self.context.period_s - self.settings.answer
         segments.add_path(move, plan, below_s if by_s > 0.0 else 0.0)
         return True
 
     def _wait(self, refusal: MovePlan, tick: int) -> None:
-        """Wait for a free path within `patience`; fail at once on any other refusal."""
+        """Wait for a free path within `patience`. Fail at once on any other refusal."""
         if self._waiting_since is None:
             self._waiting_since = tick
         self._reason = refusal.reason
         waited_s = (tick - self._waiting_since) * self.context.tick_s
-        if refusal.error != Error.NO_PATH or waited_s > self._params.patience:
+        if refusal.error != Error.NO_PATH or waited_s > self.settings.patience:
             self._fail(Error(refusal.error), refusal.reason)
 
     def _shut(self, status: PrimitiveStatus, wanted: float | None = None) -> str:
-        """Return how far the gripper has closed, if that is so far that it holds nothing, else an
-        empty text.
+        """Describe how far the gripper has closed if it holds nothing, else return an empty text.
 
-        `wanted` is the opening to which it was to go, by default the closed one.
+        Args:
+            status: Status with the opening.
+            wanted: Commanded opening. Only the closed one is judged; None stands for it.
         """
         gripper = self._gripper
         if gripper is None or wanted not in (None, gripper.closed):
             return ""
-        away = status.opening - gripper.closed
-        if not abs(away) < (self._params.grasp_gap or gripper.still):
+        opening_gap = status.opening - gripper.closed
+        if not abs(opening_gap) < (self.settings.grasp_gap or gripper.still):
             return ""
-        # As a part of its way: that is a length or an angle.
-        part = away / (gripper.open - gripper.closed)
-        return f"the gripper has closed to {part:.1%} of its way"
+        # As a part of the travel, because an opening may be a length or an angle.
+        travel_part = opening_gap / (gripper.open - gripper.closed)
+        return f"the gripper has closed to {travel_part:.1%} of its way"
 
     def _fail(self, error: Error, reason: str) -> None:
+        """Set the error of the present window; the first one counts."""
         if not self._error:
             self._error = error
             self._reason = reason
             self._request = 0
 
     def _report(self, segments: SegmentWindow, report: MoveStatus) -> None:
+        """Fill the status of this level."""
         command = self.above.message
         status = self.below.message
         report.echo = command.id
@@ -257,7 +272,7 @@ class ElementalMoveExecutor(Executor):
         report.error = self._error
         report.reason = self._reason if self._error else waits
         report.operated = status.operated or self._orders.stands
-        # Report what is done, and the progress of the move under way.
+        # Report the moves done, and the progress of the present one.
         window = command.moves[: command.count]
         under_way = segments.first
         report.done = self._done
@@ -268,11 +283,11 @@ class ElementalMoveExecutor(Executor):
         report.progress = status.progress if is_begun else 0.0
         move = find_move(window, report.current)
         report.verb = Verb.NONE if move is None else move["verb"]
-        # Report how far moves are planned: the planner continues from there.
+        # The planner continues from the last move that is reported as planned.
         report.planned = self._plans.reach(window, self._handed_down)
         end = self._plans.end(report.planned)
         if end is None:
-            # That path was handed down before a restart of this board, or has replaced such a path.
+            # The path was handed down before a restart, or has replaced such a path.
             end = segments.end()
         if report.planned <= self._done and status.resting:
             report.end = status.position
@@ -286,16 +301,14 @@ class ElementalMoveExecutor(Executor):
         above = self.above.message.operator
         below = self.below.message
         self.command.operator = self._orders.rests_on(above)
-        # Rest counts only once the level below has received the command.
+        # Rest only counts once the level below has received the command.
         self.status.resting = below.resting and below.operator >= self.command.operator
         if self.status.resting:
             self._orders.done()
         self._orders.report(self.status, above)
 
     def _reason_to_wait(self) -> str:
-        """Return the reason why the level waits, and the condition that ends the wait; empty: it
-        does not.
-        """
+        """Return why the level waits and what ends the wait, or an empty text if it does not."""
         command = self.above
         below = self.below
         if self._orders.stands:
@@ -311,6 +324,7 @@ class ElementalMoveExecutor(Executor):
         return HELD_FROM_ABOVE if command.message.hold else ""
 
     def _state(self, command: TaskCommand) -> State:
+        """Return the state to report, apart from HOLDING."""
         if self._error:
             return State.ERROR
         if not command.id:
@@ -319,5 +333,5 @@ class ElementalMoveExecutor(Executor):
 
 
 def find_move(window: Any, serial: int) -> Any:
-    """Return the move of that serial in a window of `ElementalMove`; None: it is not there."""
+    """Return the move with a serial in a window of `ElementalMove`, or None."""
     return next((move for move in window if move["id"] == serial), None)

@@ -1,6 +1,4 @@
-"""The executor's plans, which wait until their moves are due, and its segments handed down. The
-level's parameters.
-"""
+"""Parameters of the elemental move level, its store of plans, and its window of segments."""
 
 from __future__ import annotations
 
@@ -16,47 +14,47 @@ from rack.levels.messages import SEGMENTS, WINDOW, Error, MoveCommand, MovePlan,
 from rack.levels.tables import Positive, Table
 
 MAX_GAP_RAD = 0.005
-"""Paths join if no joint moves by more than this from the end of one to the start of the next."""
+"""Two paths join if no joint is farther than this from the end of one at the start of the next."""
 MAX_PLANS = 2 * WINDOW
-"""Plans kept: the planner is never farther ahead than its window, and done moves are dropped with
-the next plan."""
+"""Maximum number of stored plans. The planner is never farther ahead than its window, and plans of
+done moves are dropped with the next plan."""
 
 
 class ElementalMoveParams(Table):
-    """Bounds of patience, of grasping, and of the answers from below, in
-    `[board.<name>.params]`.
-    """
+    """`[board.<name>.params]`: patience, grasping, and the answers from below."""
 
     patience: Positive = 60.0
     """time that a move waits for a free path before it is an error, s"""
     retry: Positive = 2.0
-    """time after which a path is searched again in a world at rest, s"""
+    """time after which a path is searched again although no body has moved, s"""
     replans: int = Field(10, ge=1, le=1000)
-    """other paths that one move may take before a blocked way is an error"""
+    """number of other paths that one move may try before a blocked path is an error"""
     grasp_gap: Positive | None = None
     """a gripper closer to closed than this holds nothing, m or rad; default: a twentieth of its
-    way"""
+    travel"""
     answer: Positive = 0.3
     """time that settling and the report from below may take, s"""
 
 
 class PlanStore:
-    """The newest plan of every move from the one under way on, and the answer to the open request
-    for another path.
-    """
+    """The newest plan of every move from the present one, and the answer to the open request."""
 
     def __init__(self) -> None:
         self._by_move: dict[int, MovePlan] = {}
         self._answer: MovePlan | None = None
 
     def take(self, plan: Reading[MovePlan], done: int, handed_down: int, end: Array) -> None:
-        """Keep a new plan of a move after `handed_down`, if it begins where the path before it
-        ends.
+        """Store a new plan of a move that was not handed down, if it joins the path before it.
 
-        `end` (joints,), rad, is the end of the moves whose plans have been dropped. A plan that
-        does not join is based on one that was lost or replaced; the planner will make it again.
-        Plans of moves before `done` are dropped. After a refusal, or a path that ends elsewhere
-        than before, all later plans are dropped.
+        A plan that does not join is based on a path that was lost or replaced; the planner will
+        make it again. Plans of done moves are dropped. After a refusal, or a path that ends
+        elsewhere than the previous one, all later plans are dropped.
+
+        Args:
+            plan: Newest plan and its verdict.
+            done: Newest move done.
+            handed_down: Newest move handed down.
+            end: End of the last path whose plan has been dropped, (joints,), rad.
         """
         if not plan.is_new:
             return
@@ -71,11 +69,11 @@ class PlanStore:
             before = end
         if message.move <= handed_down or not (message.error or joins(message, before)):
             return
-        known = self._by_move.get(message.move)
+        previous = self._by_move.get(message.move)
         stays = (
-            known is not None
-            and not (known.error or message.error)
-            and is_same(end_of(known), end_of(message))
+            previous is not None
+            and not (previous.error or message.error)
+            and is_same(end_of(previous), end_of(message))
         )
         for move in [m for m in self._by_move if m > message.move and not stays]:
             del self._by_move[move]
@@ -83,17 +81,15 @@ class PlanStore:
             self._by_move[message.move] = message
 
     def of(self, move: int) -> MovePlan | None:
-        """Return the plan of a move, which may be a refusal; None: none yet."""
+        """Return the plan of a move, which may be a refusal, or None."""
         return self._by_move.get(move)
 
     def answer(self, request: int) -> MovePlan | None:
-        """Return the answer to a request for another path; None: none yet."""
+        """Return the answer to a request for another path, or None."""
         return self._answer if self._answer is not None and self._answer.replan == request else None
 
     def reach(self, window: Any, handed_down: int) -> int:
-        """Return the newest move, at least `handed_down`, up to which every motion of `window` has
-        its path.
-        """
+        """Return the last move, at least `handed_down`, before the first one that lacks a path."""
         reached = handed_down
         for move in window:
             if move["id"] == reached + 1:
@@ -105,16 +101,14 @@ class PlanStore:
         return reached
 
     def end(self, move: int) -> Array | None:
-        """Return the end of the newest path up to that of `move`, (joints,), rad; None: there is
-        none.
-        """
+        """Return the end of the newest path of any move up to `move`, (joints,), rad, or None."""
         paths = [m for m, plan in self._by_move.items() if m <= move and plan.error == Error.NONE]
         return end_of(self._by_move[max(paths)]) if paths else None
 
 
-def joins(plan: MovePlan, place: Array) -> bool:
-    """Return whether the path of a `MOVE_PLAN` begins at `place` (joints,), rad."""
-    return is_same(np.asarray(plan.waypoints[0]), place)
+def joins(plan: MovePlan, position: Array) -> bool:
+    """Return True if the path of a `MOVE_PLAN` begins at `position`, (joints,), rad."""
+    return is_same(np.asarray(plan.waypoints[0]), position)
 
 
 def end_of(plan: MovePlan) -> Array:
@@ -123,15 +117,15 @@ def end_of(plan: MovePlan) -> Array:
 
 
 def is_same(a: Array, b: Array) -> bool:
-    """Return whether a path that ends at `a` and one that begins at `b`, (joints,), rad, join."""
+    """Return True if a path that ends at `a` joins one that begins at `b`, (joints,), rad."""
     return float(np.abs(a - b).max()) <= MAX_GAP_RAD
 
 
 class SegmentWindow:
-    """Segments handed down and not known to be done, oldest first, kept in the outgoing
-    `MoveCommand` itself.
+    """Segments that were handed down and are not known to be done, oldest first.
 
-    Serials are never reused: a segment that replaces another has a newer one.
+    They are kept in the outgoing `MoveCommand` itself. Serials are never reused: a segment that
+    replaces another one has a newer serial.
     """
 
     def __init__(self, command: MoveCommand) -> None:
@@ -140,30 +134,28 @@ class SegmentWindow:
 
     @property
     def count(self) -> int:
-        """Segments in the window."""
+        """Number of segments in the window."""
         return self._command.count
 
     @property
     def is_full(self) -> bool:
-        """True when no segment may be added."""
+        """True if no segment may be added."""
         return self.count >= SEGMENTS
 
     @property
     def first(self) -> Any:
-        """The oldest segment; all zeros while `count` is 0."""
+        """The oldest segment. All zeros while `count` is 0."""
         return self._segments[0]
 
     def take_done(self, done: int) -> Any:
-        """Remove and return the oldest segment if its serial is at most `done`; else return
-        None.
-        """
+        """Remove and return the oldest segment if its serial is at most `done`, else None."""
         if not self.count or self._segments["id"][0] > done:
             return None
-        taken = self._segments[0].copy()
+        segment = self._segments[0].copy()
         self._segments[:-1] = self._segments[1:]
         self._command.count = self.count - 1
         self._blank()
-        return taken
+        return segment
 
     def clear(self) -> None:
         """Withdraw every segment."""
@@ -171,32 +163,42 @@ class SegmentWindow:
         self._blank()
 
     def add_path(self, move: Any, plan: MovePlan, by_s: float) -> None:
-        """Hand down the path of `plan` for `move`, an element of a window of `ELEMENTAL_MOVE`."""
+        """Hand down a path.
+
+        Args:
+            move: The move, an element of a window of `ELEMENTAL_MOVE`.
+            plan: Plan with its path.
+            by_s: Simulated time by which the segment must be done, or 0.
+        """
         segment = self._add(move, SegmentKind.PATH)
         segment["touch"] = move["verb"] in (Verb.APPROACH, Verb.DEPART)
         segment["by"] = by_s
         self._lay(segment, plan)
 
     def replace_first(self, plan: MovePlan) -> None:
-        """Withdraw all segments; hand down the oldest again along another path, with a new
-        serial.
-        """
+        """Withdraw all segments, and hand down the oldest one again with another path."""
         self._command.count = 1
         self._blank()
         self._command.id = self.first["id"] = self._command.id + 1
         self._lay(self.first, plan)
 
     def add_gripper(self, move: Any, opening: float, force: float) -> None:
-        """Hand down a motion of the gripper to `opening`, m or rad, with at most `force`, N or N
-        m.
+        """Hand down a motion of the gripper.
+
+        Args:
+            move: The move, an element of a window of `ELEMENTAL_MOVE`.
+            opening: Opening to reach, m or rad.
+            force: Largest force, N or N m.
         """
         segment = self._add(move, SegmentKind.GRIPPER)
         segment["opening"] = opening
         segment["force"] = force
 
     def end(self, move: int | None = None) -> Array | None:
-        """Return the last waypoint (joints,) of the newest path in the window, or of that of
-        `move`; None: there is none.
+        """Return the end of the newest path in the window, or of the path of `move`.
+
+        Returns:
+            Last waypoint, (joints,), rad, or None if there is no such path.
         """
         for segment in self._segments[: self.count][::-1]:
             if segment["kind"] == SegmentKind.PATH and move in (None, segment["move"]):
@@ -204,6 +206,7 @@ class SegmentWindow:
         return None
 
     def _add(self, move: Any, kind: SegmentKind) -> Any:
+        """Append a segment with a new serial, and return it."""
         segment = self._segments[self.count]
         self._command.count = self.count + 1
         self._command.id = segment["id"] = self._command.id + 1
@@ -213,6 +216,7 @@ class SegmentWindow:
         return segment
 
     def _lay(self, segment: Any, plan: MovePlan) -> None:
+        """Write the path of a plan to a segment."""
         segment["count"] = plan.count
         segment["waypoints"] = plan.waypoints
         segment["blend"] = plan.blend

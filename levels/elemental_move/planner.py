@@ -1,6 +1,4 @@
-"""The planner of the elemental move level: a collision-free path for every move, before it is
-due.
-"""
+"""The planner of the elemental move level: finds a collision-free path for every move."""
 
 from __future__ import annotations
 
@@ -29,13 +27,12 @@ from rack.levels.motion.path import Path
 from rack.levels.planning.moves import Move, Situation, read_window
 from rack.levels.planning.pose import Pose, pose
 from rack.levels.robot.cell import cell_of
-from rack.levels.tables import read_params
 
 ACKNOWLEDGED_CYCLES = 2
-"""Cycles until the executor's status must acknowledge a plan; otherwise the plan is lost and made
-again."""
+"""Cycles until the status of the executor must acknowledge a plan. Otherwise the plan counts as
+lost and is made again."""
 MAX_HANDED_DOWN = 1
-"""Moves after the one under way that the executor may have handed down already."""
+"""Number of moves after the present one that the executor may have handed down already."""
 
 
 class PlanningJob(NamedTuple):
@@ -43,12 +40,12 @@ class PlanningJob(NamedTuple):
 
     move: Move
     start: Array  # (joints,), rad
-    goal: Array | None = None  # required end, (joints,), rad
-    request: int = 0  # of the executor, answered by this job; 0: none
+    goal: Array | None = None  # required end, (joints,), rad, or None if free
+    request: int = 0  # request of the executor that this job answers, or 0
 
 
 class Published(NamedTuple):
-    """A path handed to the executor."""
+    """A path that was handed to the executor."""
 
     move: Move
     path: Path
@@ -56,19 +53,19 @@ class Published(NamedTuple):
 
 
 class Refusal(NamedTuple):
-    """A job without a path."""
+    """A job for which no path was found."""
 
     move: int
     request: int
     error: int
-    revision: int  # of the world in which it was tried
+    revision: int  # revision of the world in which it was tried
     again_at: int  # tick from which it is retried even in an unchanged world
 
 
 class ElementalMovePlanner(Planner):
     """Plans one move at a time: the next one without a path, from the end of the one before.
 
-    After a restart it continues from the executor's status.
+    After a restart it continues from the status of the executor.
     """
 
     above = Input(TaskCommand, "above.command")
@@ -79,59 +76,60 @@ class ElementalMovePlanner(Planner):
     world = Input(WorldState, "world.model")
     output = Output(MovePlan)
     params = ElementalMoveParams
+    settings: ElementalMoveParams
 
     @classmethod
     def preload(cls) -> None:
-        """Load the motion planner: OMPL is slow to import, so the boards inherit it."""
+        """Load the motion planner before the fork, because OMPL is slow to import."""
         from rack.levels.planning import motion_planner
 
         motion_planner.preload()
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        # OMPL takes time and memory to import: only racks that plan motions pay for it.
+        # OMPL takes time and memory to import, so only racks that plan motions import it.
         from rack.levels.planning.motion_planner import MotionPlanner
 
-        self._params = read_params(ElementalMoveParams, context.params)
         cell = cell_of(context)
         self._motion = MotionPlanner(cell, context.scene, context.seed)
         self._published: list[Published] = []
         self._job: PlanningJob | None = None
         self._window: list[Move] = []
-        self._grip: tuple[int, Pose] | None = (
-            None  # row of the object that is, or will be, held and its pose
-        )
-        self._revision = -1  # of the world in which all published paths are free
-        self._refusal: Refusal | None = None  # of the job tried last
-        self._tries = 0  # of that job
+        # Row of the object that is held or will be next, and its pose in the frame of the tool.
+        self._grip: tuple[int, Pose] | None = None
+        self._revision = -1  # revision of the world in which all published paths are free
+        self._refusal: Refusal | None = None  # refusal of the job tried last
+        self._tries = 0  # number of tries of that job
         self._answered = 0  # newest request answered
         self._answer_due = 0  # tick by which the executor must have used the answer
 
     def wanted(self, tick: int) -> bool:
-        """Return whether a path is requested, blocked or missing."""
+        """Return True if a path is requested, blocked or missing."""
         ports = (self.above, self.status, self.primitive, self.scene, self.world)
-        # A plan for a lost executor would be based on an old status; wait until it reports again.
+        # A plan for a lost executor would be based on an old status, so wait until it reports.
         if not all(port.is_there for port in ports) or self.status.is_lost:
             return False
         self._window = read_window(self.above.message)
         status = self.status.message
-        # Drop paths that are done, and those that the executor should have acknowledged but
-        # has not.
+        # Drop paths that are done, or that the executor should have acknowledged but has not.
         late = tick - ACKNOWLEDGED_CYCLES * self.context.every
-        kept = [p for p in self._published if p.move.id > status.done]
-        lost = [p.move.id for p in kept if p.move.id > status.planned and p.visible_at <= late]
-        self._published = [p for p in kept if not lost or p.move.id < lost[0]]
-        # Store how the next object, still at rest, will be grasped; after a restart, how it
-        # is held.
+        open_paths = [p for p in self._published if p.move.id > status.done]
+        lost = [
+            p.move.id for p in open_paths if p.move.id > status.planned and p.visible_at <= late
+        ]
+        self._published = [p for p in open_paths if not lost or p.move.id < lost[0]]
+        # Find how the next object, still at rest, will be grasped, or how it is held after a
+        # restart.
         world = self.world.message
         held = self.primitive.message.held
-        done = self.status.message.done
         if held < 0:
-            ahead = [
-                (m.object, m.tool) for m in self._window if m.verb is Verb.GRASP and m.id > done
+            grasps = [
+                (m.object, m.tool)
+                for m in self._window
+                if m.verb is Verb.GRASP and m.id > status.done
             ]
             self._grip = next(
-                ((row, grip_of(row, tool, world)) for row, tool in ahead if row is not None), None
+                ((row, grip_of(row, tool, world)) for row, tool in grasps if row is not None), None
             )
         elif self._grip is None or self._grip[0] != held:
             scene = self.scene.message
@@ -141,7 +139,7 @@ class ElementalMovePlanner(Planner):
         return self._job is not None and self._may_try(self._job, self.world.message.revision, tick)
 
     def plan(self, tick: int) -> None:
-        """Make the path of one move, or give the reason why there is none."""
+        """Plan the path of one move, or give the reason why there is none."""
         job = self._job
         plan = self.output
         assert job is not None, "plan is called only when one is wanted"
@@ -157,7 +155,7 @@ class ElementalMovePlanner(Planner):
         except Refused as refused:
             plan.error = Error(refused.code)
             plan.reason = str(refused)
-            again_at = visible_at + round(self._params.retry / self.context.tick_s)
+            again_at = visible_at + round(self.settings.retry / self.context.tick_s)
             self._refusal = Refusal(
                 job.move.id, job.request, refused.code, self.world.message.revision, again_at
             )
@@ -172,8 +170,9 @@ class ElementalMovePlanner(Planner):
         self._note_path(job, path, visible_at)
 
     def _requested(self, tick: int) -> PlanningJob | None:
-        """Return the job that the executor requests where the arm is blocked; its end stays, for
-        the moves after it.
+        """Return the job that the executor requests where the arm is blocked, or None.
+
+        The path keeps its end, so that the moves after it remain valid.
         """
         status = self.status.message
         if not status.replan or (status.replan == self._answered and tick < self._answer_due):
@@ -185,7 +184,10 @@ class ElementalMovePlanner(Planner):
         return None
 
     def _blocked(self) -> PlanningJob | None:
-        """Return the first path ahead that a change of the world has blocked; its end stays."""
+        """Return a job for the first path ahead that a change of the world has blocked, or None.
+
+        The path keeps its end, so that the moves after it remain valid.
+        """
         status = self.status.message
         revision = self.world.message.revision
         if revision == self._revision:
@@ -200,11 +202,11 @@ class ElementalMovePlanner(Planner):
         return None
 
     def _ahead(self) -> PlanningJob | None:
-        """Return the first move without a path."""
+        """Return a job for the first move without a path, or None."""
         status = self.status.message
         primitive = self.primitive.message
-        # The executor's report of a path's end is exact, but it may not have received the newest
-        # path yet.
+        # The end of a path that the executor reports is exact, but the executor may not have
+        # received the newest path yet.
         unseen = [p for p in self._published[-1:] if p.move.id > status.planned]
         move = next_motion(self._window, unseen[0].move.id if unseen else status.planned)
         if move is None:
@@ -216,9 +218,7 @@ class ElementalMovePlanner(Planner):
         return PlanningJob(move, np.array(primitive.position)) if primitive.resting else None
 
     def _situation(self, move: Move) -> Situation:
-        """Return the situation when `move` begins: the world as sensed, changed by the moves before
-        it.
-        """
+        """Return the situation when `move` begins: the sensed world after the moves before it."""
         world = self.world.message
         held = self.primitive.message.held
         done = self.status.message.done
@@ -227,16 +227,22 @@ class ElementalMovePlanner(Planner):
             grip = None if self._grip is None else self._grip[1]
             situation = situation.holding(held, grip)
         for earlier in self._window:
-            # A grasp may be reported done only after the object is reported held: it must not count
+            # A grasp may be reported done only after the object is reported held. It must not count
             # twice.
-            known = earlier.verb is Verb.GRASP and earlier.object == situation.held
-            if done < earlier.id < move.id and not known:
+            is_counted = earlier.verb is Verb.GRASP and earlier.object == situation.held
+            if done < earlier.id < move.id and not is_counted:
                 situation = situation.after(earlier)
         return situation
 
     def _may_try(self, job: PlanningJob, revision: int, tick: int) -> bool:
-        """Return whether a job may be tried: a refused one only after a change of the world, or
-        after `retry`.
+        """Return True if a job may be tried.
+
+        A refused job is tried again after a change of the world or after `retry`.
+
+        Args:
+            job: Job to try.
+            revision: Revision of the present world.
+            tick: Tick of the cycle.
         """
         refusal = self._refusal
         if refusal is None or (refusal.move, refusal.request) != (job.move.id, job.request):
@@ -247,22 +253,27 @@ class ElementalMovePlanner(Planner):
         )
 
     def _note_path(self, job: PlanningJob, path: Path, visible_at: int) -> None:
+        """Record a path that was found; it may replace an earlier one.
+
+        Args:
+            job: Job that is done.
+            path: Its path.
+            visible_at: Tick from which the executor sees the path.
+        """
         self._refusal = None
         if job.request:
             self._answered = job.request
             self._answer_due = visible_at + ACKNOWLEDGED_CYCLES * self.context.every
         published = Published(job.move, path, visible_at)
-        known = [p.move.id for p in self._published]
-        if job.move.id in known:
-            self._published[known.index(job.move.id)] = published
+        published_ids = [p.move.id for p in self._published]
+        if job.move.id in published_ids:
+            self._published[published_ids.index(job.move.id)] = published
         elif not job.request:
             self._published.append(published)
 
 
 def next_motion(window: Sequence[Move], newest: int) -> Move | None:
-    """Return the first motion after move `newest`; None when the window does not reach it without a
-    gap.
-    """
+    """Return the first motion after move `newest`, or None if the window has a gap before it."""
     for move in window:
         if move.id == newest + 1:
             if move.is_motion:
@@ -272,7 +283,11 @@ def next_motion(window: Sequence[Move], newest: int) -> Move | None:
 
 
 def grip_of(row: int, tool: Pose, seen: Scene | WorldState) -> Pose:
-    """Return the pose of object `row` in the frame of a tool at `tool`; `seen` is a Scene or a
-    WorldState.
+    """Return the pose of an object in the frame of the tool.
+
+    Args:
+        row: Row of the object.
+        tool: Pose of the tool.
+        seen: Scene or world model that contains the object.
     """
     return tool.inverse() @ pose(seen.position[row], seen.quaternion[row])

@@ -1,3 +1,4 @@
-"""Planning for an arm: inverse kinematics, collisions, payloads, paths. Deterministic, in any
-process.
+"""Motion planning for an arm: inverse kinematics, collisions, payloads and paths.
+
+Everything is deterministic: equal arguments give equal results in any process.
 """

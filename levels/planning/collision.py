@@ -1,7 +1,7 @@
-"""Collisions of the arm and its load with the cell and with each other.
+"""Collisions of the arm and its load with the surroundings and with each other.
 
 MuJoCo finds the close pairs of geoms. A matrix of required distances, one entry per pair, decides
-which of them count.
+which of them are collisions.
 """
 
 from __future__ import annotations
@@ -29,21 +29,26 @@ from rack.levels.robot.lookup import geom_name
 from rack.levels.tables import SceneConfig
 
 MAX_TOUCH_DEPTH_M = 0.003
-"""Depth of an intended contact: simulated bodies are soft and sensed poses are not exact."""
+"""Permitted depth of an intended contact. Simulated bodies are soft, and sensed poses inexact."""
 MAX_HELD_DEPTH_M = 0.01
-"""Depth of a contact between a held object and its supports: the object slides by some millimetres
-in the gripper when it moves fast, and its support pushes it back as it is put down."""
+"""Permitted depth of a contact between a held object and its support. The object slides by some
+millimetres in the gripper in fast motion, and its support pushes it back when it is put down."""
 
 ANY_DISTANCE = -np.inf
 """Required distance of a pair that may overlap."""
 
 LINK, GRIPPER, LOAD = 1, 2, 4
-"""Contact types of the arm's geoms and of those that it holds; all others have none."""
+"""Contact types of the geoms of the arm and its load. All other geoms have none."""
 
 
 def place_bodies(cell: Cell, data: mujoco.MjData, positions: Array, quaternions: Array) -> None:
-    """Place objects and obstacles in `data` at the world model's poses: (bodies, 3) in m, (bodies,
-    4) as w, x, y, z.
+    """Place objects and obstacles in simulation data at the poses of the world model.
+
+    Args:
+        cell: Model that the data belong to.
+        data: Data to change.
+        positions: (bodies, 3), m.
+        quaternions: (bodies, 4), as w, x, y, z.
     """
     for row, address in enumerate(cell.object_qpos):
         data.qpos[address : address + 3] = positions[row]
@@ -54,33 +59,38 @@ def place_bodies(cell: Cell, data: mujoco.MjData, positions: Array, quaternions:
 
 
 class CollisionChecker:
-    """Decides whether a configuration of the arm is free, on its own copy of the cell.
+    """Decides whether a configuration of the arm is free, on a copy of the cell's model.
 
-    The arm, with its open gripper and its load, keeps `scene.clearance` from everything else. Links
-    may be close to each other and to the body that carries the arm, but keep `margin`, m, as the
-    gripper does from supports; the first may be near what it stands on. One instance serves one
-    task; a check takes some microseconds.
+    The arm, with its open gripper and its load, must keep `scene.clearance` from everything else.
+    Links must keep `margin`, m, from each other and from the body that carries the arm. The gripper
+    must keep it from supports. The first link may be near its base. One instance serves one task. A
+    check takes some microseconds.
+
+    Attributes:
+        held: Row of the object that is carried, or None.
+        longest_opening: Opening at which the gripper is longest, or None when that is the open one.
     """
 
     def __init__(self, cell: Cell, scene: SceneConfig, margin: float = 0.0) -> None:
         self.cell = cell
         self.clearance = scene.clearance  # m
-        self.held: int | None = None  # row of the object that is carried
+        self.held: int | None = None
         self._touched: int | None = None
         self._margin = margin
         self._row_geoms = [cell.parts(row) for row in range(len(cell.bodies))]
-        self._offset = np.zeros(7)  # pose of the held object in the tool's frame: m; w, x, y, z
+        # Pose of the held object in the frame of the tool: m, then w, x, y, z.
+        self._offset = np.zeros(7)
         self._model = restricted_to_arm(cell, self.clearance, margin)
         self._types = np.stack((self._model.geom_contype, self._model.geom_conaffinity))
         self._data = mujoco.MjData(self._model)
         mujoco.mj_resetDataKeyframe(self._model, self._data, 0)
-        # Fingers that swing may reach farther than open as they close: a load is planned with them
-        # so.
+        # Swinging fingers may reach farther while they close. With a load, paths are checked at
+        # that opening.
         self.longest = self._longest() if margin > 0.0 else None
         self._base = required_distances(cell, self._model, self.clearance, margin)
         self._required = self._base.copy()
-        self._one = np.zeros((1, len(cell.qpos)))  # room for one configuration to check
-        self._least = np.inf  # m: the clearance of the last configuration checked
+        self._one = np.zeros((1, len(cell.qpos)))  # buffer for a single configuration
+        self._least = np.inf  # m: clearance used for the last configuration checked
         m = self._model
         d = self._data
         tool = (d.site_xpos[cell.tool], d.site_xmat[cell.tool])
@@ -90,24 +100,30 @@ class CollisionChecker:
         )
 
     def tool_at(self, q: Array) -> Pose:
-        """Return the tool's pose at `q` (joints,), rad."""
+        """Return the pose of the tool at `q`, (joints,), rad."""
         self._data.qpos[self.cell.qpos] = q
         mujoco.mj_kinematics(self._model, self._data)
         return site_pose(self._data, self.cell.tool)
 
     def place(self, positions: Array, quaternions: Array) -> None:
-        """Place objects and obstacles, as `place_bodies`."""
+        """Place objects and obstacles, as the function `place_bodies` does."""
         place_bodies(self.cell, self._data, positions, quaternions)
 
     def open_gripper(self, opening: float) -> None:
-        """Set the gripper to `opening`, m or rad; initially it is at its widest."""
+        """Set the gripper to `opening`, m or rad. Initially it is open."""
         if self.cell.gripper is not None:
             self.cell.gripper.linkage.set(self._data.qpos, opening)
 
     def hold(
         self, row: int | None, position: ArrayLike = (0, 0, 0), quaternion: ArrayLike = (1, 0, 0, 0)
     ) -> None:
-        """Carry object `row` at a pose in the tool's frame (m; w, x, y, z); None: carry nothing."""
+        """Carry an object with the tool.
+
+        Args:
+            row: Row of the object, or None to carry nothing.
+            position: Position in the frame of the tool, m.
+            quaternion: Orientation in that frame, as w, x, y, z.
+        """
         self.held = row
         if self.longest is not None and (gripper := self.cell.gripper) is not None:
             opening = gripper.open if row is None else self.longest
@@ -117,36 +133,50 @@ class CollisionChecker:
         m = self._model
         m.geom_contype[:], m.geom_conaffinity[:] = self._types
         if row is not None:
-            # Gripper and load meet, which is permitted and took a fifth of a check.
+            # The load touches the gripper, which is permitted. Skipping these pairs saves a fifth
+            # of a check.
             m.geom_contype[self._row_geoms[row]] = LOAD
             m.geom_conaffinity[self._row_geoms[row]] &= LINK
         self._apply()
 
     def permit(self, row: int | None, touch: bool = True) -> None:
-        """Permit or forbid contact of object `row` with supports and gripper, and a gripper close
-        to supports.
+        """Permit contact of an object with supports and gripper, or forbid it again.
+
+        While it is permitted, the gripper may also come closer to supports.
+
+        Args:
+            row: Row of the object, or None.
+            touch: False forbids the contact.
         """
         self._touched = row if touch else None
         self._apply()
 
     def free(self, q: Array, clearance: float | None = None) -> bool:
-        """Return whether the arm at `q` (joints,), rad, keeps its distances. `clearance`, m, may
-        lower the scene's.
+        """Return True if the arm at `q`, (joints,), rad, keeps its required distances.
+
+        A `clearance`, m, may lower the one of the scene.
         """
         self._one[0] = q
         return self.first_blocked(self._one, clearance) == 1
 
     def first_blocked(self, path: Array, clearance: float | None = None) -> int:
-        """Return the index of the first of the configurations `path` (n, joints), rad, that is not
-        free; n: all are. Those after it are not looked at.
+        """Find the first configuration of a path that is not free; later ones are not checked.
+
+        Args:
+            path: Configurations, (n, joints), rad.
+            clearance: Lowers the clearance of the scene, m.
+
+        Returns:
+            Index of that configuration, or n if all are free.
         """
         self._least = np.inf if clearance is None else float(clearance)
         held_qpos = -1 if self.held is None else self.cell.object_qpos[self.held]
         return self._first_blocked(held_qpos, self._least, path)
 
     def room(self, q: Array) -> float:
-        """Return the largest clearance, in m and at most the scene's, with which `q` is free;
-        negative: with none.
+        """Return the largest clearance with which `q` is free, m, at most the scene's.
+
+        It is negative if `q` is not free with any clearance.
         """
         self.free(q)
         short = self._shortfalls()
@@ -155,19 +185,20 @@ class CollisionChecker:
         close = short > 0
         if np.any(close & (required <= 0)):
             return -1.0
-        # Where less than the clearance is required, more of it is missing.
+        # A pair that needs less than the clearance limits it by the difference, too.
         lacking = short[close] + (self.clearance - required[close])
         return self.clearance - max(0.0, float(np.max(lacking, initial=0.0)))
 
     def why(self, q: Array, clearance: float | None = None) -> str:
-        """Name the pair of geoms that violates its distance most at `q`, and both distances; empty:
-        `q` is free.
+        """Describe the worst violation at `q`: the pair of geoms and both distances.
+
+        The text is empty if `q` is free.
         """
         self.free(q, clearance)
         return self.nearest()
 
     def nearest(self) -> str:
-        """Name that pair for the last configuration checked."""
+        """Describe the worst violation at the last configuration checked."""
         short = self._shortfalls()
         if not np.any(short > 0):
             return ""
@@ -175,12 +206,13 @@ class CollisionChecker:
         first, second = self._data.contact.geom[worst]
         distance = self._data.contact.dist[worst]
         pair = f"'{geom_name(self._model, first)}' and '{geom_name(self._model, second)}'"
-        least = distance + short[worst]
-        return f"{pair} are {distance * 1e3:.1f} mm apart; valid: {least * 1e3:.1f} mm"
+        required = distance + short[worst]
+        return f"{pair} are {distance * 1e3:.1f} mm apart; valid: {required * 1e3:.1f} mm"
 
     def _shortfalls(self) -> Array:
-        """Return by how much each close pair of the last configuration falls short of its required
-        distance, in m.
+        """Return by how much each close pair misses its required distance, m.
+
+        It refers to the last configuration checked.
         """
         contact = self._data.contact
         pairs = contact.geom
@@ -189,25 +221,23 @@ class CollisionChecker:
         )
 
     def _longest(self) -> float | None:
-        """Return the opening at which the gripper reaches farthest along the tool; None: when
-        open.
-        """
+        """Return the opening at which the gripper reaches farthest along the tool, None if open."""
         gripper = self.cell.gripper
         if gripper is None:
             return None
         data = self._data
-        found = []
+        extents = []
         for opening in (gripper.open, *gripper.linkage.openings):
             self.open_gripper(opening)
             mujoco.mj_kinematics(self._model, data)
             axis = data.site_xmat[self.cell.tool].reshape(3, 3)[:, 2]
-            found.append((farthest(self._model, data, self.cell.gripper_geoms, axis), opening))
+            extents.append((farthest(self._model, data, self.cell.gripper_geoms, axis), opening))
         self.open_gripper(gripper.open)
-        reached, opening = max(found)
-        return float(opening) if reached > found[0][0] + self._margin else None
+        reached, opening = max(extents)
+        return float(opening) if reached > extents[0][0] + self._margin else None
 
     def _apply(self) -> None:
-        """Set the required distances for the held object and the one that may be touched."""
+        """Update the required distances for the held object and the one that may be touched."""
         self._required[:] = self._base
         arm = self.cell.arm_geoms
         gripper = self.cell.gripper_geoms
@@ -228,14 +258,21 @@ class CollisionChecker:
             self._require(touched, supports, to_supports)
             self._require(gripper, supports, self._margin)
 
-    def _require(self, some: Ints, others: Ints, distance: float) -> None:
-        self._required[some[:, None], others] = distance
-        self._required[others[:, None], some] = distance
+    def _require(self, group: Ints, other_group: Ints, distance: float) -> None:
+        """Set the required distance, m, of all pairs between two groups of geoms."""
+        self._required[group[:, None], other_group] = distance
+        self._required[other_group[:, None], group] = distance
 
 
 def restricted_to_arm(cell: Cell, clearance: float, margin: float) -> mujoco.MjModel:
-    """Return a model of the cell in which MuJoCo finds close pairs that involve the arm, a tenth of
-    the work, but for those within the gripper.
+    """Return a copy of the model in which MuJoCo only finds close pairs that involve the arm.
+
+    This is a tenth of the work. Pairs within the gripper are left out.
+
+    Args:
+        cell: Cell with the model.
+        clearance: Distance up to which other pairs are found, m.
+        margin: Distance up to which pairs of links are found, m.
     """
     model = copy.copy(cell.model)
     solid = (model.geom_contype | model.geom_conaffinity) != 0
@@ -244,7 +281,7 @@ def restricted_to_arm(cell: Cell, clearance: float, margin: float) -> mujoco.MjM
     model.geom_conaffinity[:] = (LINK | GRIPPER | LOAD) * solid
     model.geom_contype[cell.gripper_geoms] *= GRIPPER
     model.geom_conaffinity[cell.gripper_geoms] &= LINK
-    # MuJoCo adds the margins of the two geoms: two links find each other within twice the margin.
+    # MuJoCo adds the margins of the two geoms, so two links are found within twice the margin.
     set_margins(model, np.where(arm, margin, clearance))
     model.geom_gap[:] = 0.0
     model.pair_margin[:] = clearance
@@ -254,37 +291,46 @@ def restricted_to_arm(cell: Cell, clearance: float, margin: float) -> mujoco.MjM
 def required_distances(
     cell: Cell, restricted: mujoco.MjModel, clearance: float, margin: float
 ) -> Array:
-    """Return (geoms, geoms), in m: the clearance between arm and cell, the margin between links
-    that may collide.
+    """Return the required distance of every pair of geoms.
 
-    Links that are close to each other at home, or the first to what is fixed, keep only half their
-    distance there: some always are. So are some to the fixed bodies that carry the arm.
+    Arm and surroundings must keep the clearance, links that may collide the margin. Some links are
+    always close to each other, and links near the base are close to fixed bodies. Such pairs only
+    have to keep half of their distance at home.
+
+    Args:
+        cell: Cell with the model.
+        restricted: Model from `restrict_to_arm`.
+        clearance: Distance between arm and surroundings, m.
+        margin: Distance between links, m.
+
+    Returns:
+        Distances, (geoms, geoms), m.
     """
     model = cell.model
     arm = cell.arm_geoms
     gripper = cell.gripper_geoms
-    first = model.dof_bodyid[cell.dof[0]]
+    first_link = model.dof_bodyid[cell.dof[0]]
     carriers = []
-    body = model.body_parentid[first]
+    body = model.body_parentid[first_link]
     while body > 0:
         carriers.append(body)
         body = model.body_parentid[body]
-    own = np.union1d(arm, np.flatnonzero(np.isin(model.geom_bodyid, carriers)))
+    arm_and_carriers = np.union1d(arm, np.flatnonzero(np.isin(model.geom_bodyid, carriers)))
     kinds = model.geom_contype
     affinity = model.geom_conaffinity
     collide = (kinds[:, None] & affinity[None, :]) | (kinds[None, :] & affinity[:, None]) != 0
     required = np.full((model.ngeom, model.ngeom), ANY_DISTANCE)
     required[arm, :] = required[:, arm] = clearance
-    for some, others in ((arm, own), (own, arm)):
-        pairs = np.ix_(some, others)
+    for group, other_group in ((arm, arm_and_carriers), (arm_and_carriers, arm)):
+        pairs = np.ix_(group, other_group)
         required[pairs] = np.where(collide[pairs], margin, ANY_DISTANCE)
-    # Links of a gripper meet at their pins, and its motion is not planned.
+    # Links of a gripper touch at their pins, and the motion of the gripper is not planned.
     required[np.ix_(gripper, gripper)] = ANY_DISTANCE
     data = mujoco.MjData(restricted)
     mujoco.mj_resetDataKeyframe(restricted, data, 0)
     mujoco.mj_fwdPosition(restricted, data)
-    is_own = np.isin(np.arange(model.ngeom), own)
-    is_foot = np.isin(model.body_weldid[model.geom_bodyid], (0, first))
+    is_own = np.isin(np.arange(model.ngeom), arm_and_carriers)
+    is_foot = np.isin(model.body_weldid[model.geom_bodyid], (0, first_link))
     for pair, distance in zip(data.contact.geom, data.contact.dist, strict=True):
         if is_own[pair].all() or is_foot[pair].all():
             one, other = pair
@@ -294,10 +340,15 @@ def required_distances(
 
 
 def farthest(model: mujoco.MjModel, data: mujoco.MjData, geoms: Ints, axis: ArrayLike) -> float:
-    """Return how far bounding boxes of geoms reach along `axis` (3,), a unit vector, from the
-    origin, m.
+    """Return how far the bounding boxes of geoms reach along an axis from the origin, m.
+
+    Args:
+        model: Model of the geoms.
+        data: Data with their poses.
+        geoms: Ids of the geoms.
+        axis: Unit vector, (3,).
     """
-    # A box's extent along an axis: its half sizes times the axis in its own frame.
+    # The half extent of a box is the product of its half sizes and the axis in its frame.
     along = np.sum(data.geom_xmat[geoms].reshape(-1, 3, 3) * np.reshape(axis, (3, 1)), axis=1)
     centre = model.geom_aabb[geoms, :3]
     half = model.geom_aabb[geoms, 3:]
@@ -314,23 +365,41 @@ def farthest(model: mujoco.MjModel, data: mujoco.MjData, geoms: Ints, axis: Arra
     "f8[:], i8, f8, f8[:,::1]"
 )
 def first_blocked(  # noqa: PLR0913  # flat, as `advance` in levels/arm/substeps.py
-    model: int,  # address
-    data: int,  # address
-    joints: NDArray[np.int64],  # (joints,): their addresses in qpos
+    model: int,
+    data: int,
+    joints: NDArray[np.int64],  # (joints,)
     qpos: Array,
-    tool: Array,  # (3,), m: where kinematics leave its position
-    turned: Array,  # (9,): and its rotation
-    offset: Array,  # (7,): pose of the held object in the tool's frame
-    required: Array,  # (geoms, geoms), m: distances
-    number: NDArray[np.int32],  # of contacts, and so on: see `ContactViews`
+    tool: Array,  # (3,), m
+    turned: Array,  # (9,)
+    offset: Array,  # (7,), m, then w, x, y, z
+    required: Array,  # (geoms, geoms), m
+    number: NDArray[np.int32],
     geoms: NDArray[np.int32],
-    distance: Array,
-    held: int,  # address of the held object in qpos; -1: none
-    clearance: float,  # m: greatest distance that is required
-    path: Array,  # (n, joints), rad: to be checked
+    distance: Array,  # m
+    held: int,
+    clearance: float,  # m
+    path: Array,  # (n, joints), rad
 ) -> int:
-    """Bring arm and load to one configuration after another; return the index of the first in which
-    a pair of geoms does not keep its distance; n: all do.
+    """Find the first configuration in which a pair of geoms misses its required distance.
+
+    Args:
+        model: Address of the model.
+        data: Address of the data.
+        joints: Addresses of the joints in `qpos`.
+        qpos: Positions in the data.
+        tool: Position of the tool in the data.
+        turned: Rotation matrix of the tool in the data.
+        offset: Pose of the held object in the frame of the tool.
+        required: Required distances.
+        number: Counts of contacts and more, see `ContactViews`.
+        geoms: Pairs of geoms in contact.
+        distance: Distances of the pairs.
+        held: Address of the held object in `qpos`, or -1.
+        clearance: Largest distance that is required.
+        path: Configurations to check.
+
+    Returns:
+        Index of that configuration, or n if there is none.
     """
     for k in range(len(path)):
         for j in range(len(joints)):
@@ -348,7 +417,14 @@ def first_blocked(  # noqa: PLR0913  # flat, as `advance` in levels/arm/substeps
 
 @compiled
 def carry(pose: Array, tool: Array, turned: Array, offset: Array) -> None:
-    """Set the pose of the held object (7,), by that of the tool; arguments as above."""
+    """Set the pose of the held object from the pose of the tool.
+
+    Args:
+        pose: Output: position, m, then w, x, y, z, (7,).
+        tool: Position of the tool, (3,), m.
+        turned: Rotation matrix of the tool, (9,).
+        offset: Pose of the object in the frame of the tool, (7,).
+    """
     for i in range(3):
         along = (
             turned[3 * i] * offset[0]

@@ -1,9 +1,8 @@
-"""Inverse kinematics: configurations that put the tool at a pose, by damped least squares with
-restarts.
+"""Inverse kinematics: joint configurations that put the tool at a pose.
 
-A step is a quadratic program bounded by the joints' limits; MuJoCo solves it. Alternative
-considered: mink, which does the same on numpy and a solver of choice, but the bits of its matrix
-products depend on the processor.
+It uses damped least squares with random restarts. A step is a quadratic program bounded by the
+joint limits, which MuJoCo solves. The library mink does the same on numpy and a solver of choice,
+but the last bits of its matrix products depend on the processor.
 """
 
 from __future__ import annotations
@@ -18,62 +17,70 @@ from rack.levels.planning.pose import Pose, site_pose
 from rack.levels.robot.cell import Cell
 
 MAX_RESTARTS = 60
-"""Random starts for one pose: of 300 random poses of the K-1607, 40 starts missed one."""
+"""Maximum number of random starts for one pose. With 40, one of 300 random poses was missed."""
 MAX_IDLE_STARTS = 12
-"""Consecutive starts without a new solution that end the search, once there is a solution."""
+"""Number of consecutive starts without a new solution that end the search, after the first one."""
 MAX_SOLUTIONS = 8
-"""Solutions of one pose: a redundant arm has infinitely many."""
+"""Maximum number of solutions for one pose. A redundant arm has infinitely many."""
 MAX_ITERATIONS = 25
+"""Maximum number of steps from one start."""
 STALLED_ITERATIONS = 5
 STALLED_PART = 0.7
-"""A descent is abandoned when its error has not fallen to this part within `STALLED_ITERATIONS`."""
+"""A descent is abandoned if its error has not fallen to this part within `STALLED_ITERATIONS`."""
 TOLERANCE = 1e-5
-"""Of each part of the tool's error, in m and in rad."""
+"""Permitted error in each component of the tool's pose, m or rad."""
 SAME_RAD = 1e-2
 """Solutions closer than this in every joint count as one."""
 LIMIT_MARGIN_RAD = 1e-2
-"""Solutions stay this far inside the position limits: the limit gate of the servo level brakes
-there."""
+"""Distance of solutions from the position limits, because the limit gate of the servo level brakes
+near them."""
 MAX_BRANCH_STEP_RAD = 0.5
-"""A warm start that ends farther away than this in a joint has left its branch."""
+"""A solution farther than this from its start in any joint is on another branch."""
 DAMPING = 1e-6
-"""Damping of a step, in squared tool error per rad, and as much again for an error of 1 m or 1
-rad."""
+"""Damping of a step, in squared tool error per squared joint step. It doubles at an error of 1 m or
+1 rad."""
 LIMIT_PART = 0.95
-"""Part of the way to a position limit that one step may take."""
+"""Part of the distance to a position limit that one step may cover."""
 
 
 class InverseKinematics:
-    """Solves for the tool of one arm. Pure: equal arguments give equal results."""
+    """Inverse kinematics of one arm. Equal arguments give equal results."""
 
     def __init__(self, cell: Cell, seed: int) -> None:
         self._cell = cell
         self._seed = seed
         self._pace = 1.0 / cell.limits.velocity
-        limits = cell.limits.position
-        self._inner_low = limits[:, 0] + LIMIT_MARGIN_RAD
-        self._inner_high = limits[:, 1] - LIMIT_MARGIN_RAD
+        low, high = cell.limits.position.T
+        self._inner_low = low + LIMIT_MARGIN_RAD
+        self._inner_high = high - LIMIT_MARGIN_RAD
         self._data = mujoco.MjData(cell.model)
         joints = len(cell.qpos)
         self._jacobian = np.zeros((6, cell.model.nv))
-        self._factor = np.zeros((joints, joints + 7))  # room for the solver
+        self._factor = np.zeros((joints, joints + 7))  # work space of the solver
         self._low, self._high = sampling_range(cell)
 
     def tool_at(self, q: Array) -> Pose:
-        """Return the tool's pose at `q` (joints,), rad."""
+        """Return the pose of the tool at `q`, (joints,), rad."""
         self._data.qpos[self._cell.qpos] = q
         mujoco.mj_kinematics(self._cell.model, self._data)
         return site_pose(self._data, self._cell.tool)
 
-    def reach(self, target: Pose, start: Array, turned: bool = True) -> Array | None:
-        """Return the configuration (joints,) at `target` found by one descent from `start`, or
-        None; without `turned` in any orientation.
+    def reach(self, target: Pose, start: Array, match_orientation: bool = True) -> Array | None:
+        """Find a configuration by one descent.
+
+        Args:
+            target: Pose for the tool.
+            start: Configuration to start from, (joints,), rad.
+            match_orientation: False accepts any orientation of the tool.
+
+        Returns:
+            Configuration, (joints,), rad, or None.
         """
         q = np.clip(start, self._inner_low, self._inner_high)
         errors: list[float] = []
         for _ in range(MAX_ITERATIONS):
             error = self._error(target, q)
-            if not turned:
+            if not match_orientation:
                 error[3:] = 0.0
             if (np.abs(error) < TOLERANCE).all():
                 return q
@@ -83,20 +90,18 @@ class InverseKinematics:
                 and errors[-1] > STALLED_PART * errors[-1 - STALLED_ITERATIONS]
             ):
                 return None
-            step = self._step(error, q, turned)
+            step = self._step(error, q, match_orientation)
             if step is None:
                 return None
             q = q + step
         return None
 
     def nearby(self, target: Pose, start: Array) -> Array | None:
-        """Return the configuration at `target` on the branch of `start`; None: there is none
-        nearby.
-        """
-        found = self.reach(target, start)
+        """Return the configuration at `target` on the branch of `start`, or None."""
+        solution = self.reach(target, start)
         return (
-            found
-            if found is not None and bool(np.all(np.abs(found - start) < MAX_BRANCH_STEP_RAD))
+            solution
+            if solution is not None and bool(np.all(np.abs(solution - start) < MAX_BRANCH_STEP_RAD))
             else None
         )
 
@@ -107,44 +112,59 @@ class InverseKinematics:
         free: Callable[[Array], bool],
         restarts: int = MAX_RESTARTS,
     ) -> list[Array]:
-        """Return distinct free configurations at `target`, the quickest to reach from `reference`
-        first.
+        """Find distinct collision-free configurations, the quickest to reach first.
 
-        Empty when `target` is out of reach or everything there collides.
+        Args:
+            target: Pose for the tool.
+            reference: Configuration to reach them from, (joints,), rad.
+            free: Decides whether a configuration is free.
+            restarts: Maximum number of random starts.
+
+        Returns:
+            Configurations, (joints,), rad. Empty if the target is out of reach or everything
+            collides.
         """
         return [q for q in self.reachable(target, reference, restarts=restarts) if free(q)]
 
     def reachable(
-        self, target: Pose, reference: Array, turned: bool = True, restarts: int = MAX_RESTARTS
+        self,
+        target: Pose,
+        reference: Array,
+        match_orientation: bool = True,
+        restarts: int = MAX_RESTARTS,
     ) -> list[Array]:
-        """Return distinct configurations at `target`, free or not, the quickest to reach first;
-        without `turned` in any orientation.
+        """Find distinct configurations, free or not, the quickest to reach first.
+
+        Args:
+            target: Pose for the tool.
+            reference: Configuration to reach them from, (joints,), rad.
+            match_orientation: False accepts any orientation of the tool.
+            restarts: Maximum number of random starts.
+
+        Returns:
+            Configurations, (joints,), rad.
         """
         rng = np.random.default_rng(self._seed)
-        found: list[Array] = []
+        solutions: list[Array] = []
         idle = 0
         start = reference
         for _ in range(1 + restarts):
-            q = self.reach(target, start, turned)
-            known = q is None or any(np.all(np.abs(q - other) < SAME_RAD) for other in found)
-            idle = idle + 1 if known else 0
-            if q is not None and not known:
-                found.append(q)
-            if len(found) == MAX_SOLUTIONS or (found and idle >= MAX_IDLE_STARTS):
+            q = self.reach(target, start, match_orientation)
+            is_known = q is None or any(np.all(np.abs(q - other) < SAME_RAD) for other in solutions)
+            idle = idle + 1 if is_known else 0
+            if q is not None and not is_known:
+                solutions.append(q)
+            if len(solutions) == MAX_SOLUTIONS or (solutions and idle >= MAX_IDLE_STARTS):
                 break
             start = rng.uniform(self._low, self._high)
-        return sorted(found, key=lambda q: self.time_between(reference, q))
+        return sorted(solutions, key=lambda q: self.time_between(reference, q))
 
-    def time_between(self, one: Array, other: Array) -> float:
-        """Return the time, in s, of the slowest joint from `one` to `other` at its velocity
-        limit.
-        """
-        return float(np.max(np.abs(one - other) * self._pace))
+    def time_between(self, start: Array, end: Array) -> float:
+        """Return the time that the slowest joint takes at its velocity limit, s."""
+        return float(np.max(np.abs(start - end) * self._pace))
 
     def _error(self, target: Pose, q: Array) -> Array:
-        """Return (6,): the way, m, and the turn, rad, from the tool at `q` to `target`; world
-        frame.
-        """
+        """Return the error of the tool at `q`, (6,): distance, m, then rotation, rad."""
         tool = self.tool_at(q)
         turn = np.zeros(3)
         error = np.zeros(6)
@@ -153,16 +173,20 @@ class InverseKinematics:
         mujoco.mju_rotVecQuat(error[3:], turn, tool.quaternion)
         return error
 
-    def _step(self, error: Array, q: Array, turned: bool) -> Array | None:
-        """Return the step (joints,), rad, that best reduces `error`, the error at `q`; None: there
-        is none.
+    def _step(self, error: Array, q: Array, match_orientation: bool) -> Array | None:
+        """Return the bounded step that best reduces the error, (joints,), rad, or None.
+
+        Args:
+            error: Error at `q`.
+            q: Configuration, (joints,), rad.
+            match_orientation: False ignores the orientation.
         """
         m = self._cell.model
         d = self._data
         mujoco.mj_comPos(m, d)
         mujoco.mj_jacSite(m, d, self._jacobian[:3], self._jacobian[3:], self._cell.tool)
         jacobian = self._jacobian.take(self._cell.dof, axis=1)
-        if not turned:
+        if not match_orientation:
             jacobian[3:] = 0.0
         hessian = gram(jacobian)
         step = np.zeros(len(q))
@@ -175,7 +199,6 @@ class InverseKinematics:
 
 
 def sampling_range(cell: Cell) -> tuple[Array, Array]:
-    """Return low and high (joints,), in rad: the limits, or one turn for a joint without limits."""
-    low = cell.limits.position[:, 0]
-    high = cell.limits.position[:, 1]
+    """Return low and high, (joints,), rad: the limits, or one turn for a joint without limits."""
+    low, high = cell.limits.position.T
     return np.where(np.isfinite(low), low, -np.pi), np.where(np.isfinite(high), high, np.pi)

@@ -1,5 +1,6 @@
-"""The path of one elemental move: inverse kinematics, then a straight tool line or a search in
-joint space.
+"""The path of one elemental move: inverse kinematics, then a straight line or a search.
+
+A straight line is one of the tool, a search is in joint space.
 """
 
 from __future__ import annotations
@@ -25,32 +26,30 @@ from rack.levels.robot.cell import Cell
 from rack.levels.tables import SceneConfig
 
 CLOSE_PART = 0.9
-"""Part of the remaining clearance that a path keeps where the arm starts too close to something."""
+"""Part of the remaining clearance that a path keeps if the arm starts too close to something."""
 LOAD_STEP_RAD = 0.25
 """Spacing of the configurations at which the motors must carry the load."""
 AHEAD_PART = 0.5
-"""Part of the clearance that an earlier path must keep: sensed and predicted poses differ
+"""Part of the clearance that an earlier path must keep, because sensed and predicted poses differ
 slightly."""
 MAX_STRAY_M = 1e-3
-"""Largest distance of the tool from a straight line that it follows."""
+"""Largest deviation of the tool from a straight line that it follows."""
 LINES = (1, 2, 3, 4, 6, 8, 12, 16, 20)
-"""Numbers of joint-space lines that are tried: the fewest that keep to the tool's line give the
-quickest path."""
+"""Numbers of joint-space lines that are tried for a straight line of the tool. The fewest that keep
+to it give the quickest path."""
 STRAY_SAMPLES = 5
-"""Points of every joint-space line at which the tool's distance from its line is measured."""
+"""Number of points on every joint-space line at which the deviation of the tool is measured."""
 
 
 def preload() -> None:
     """Load what every process that plans motions needs."""
-    import numpy.random  # noqa: F401  # numpy imports it at its first use
+    import numpy.random  # noqa: F401  # numpy loads it at its first use
 
     compiled.preload(collision, paths, path_planner)
 
 
 class MotionPlanner:
-    """Plans elemental moves for one arm. Pure: equal arguments give equal paths, in every
-    process.
-    """
+    """Plans elemental moves for one arm. Equal arguments give equal paths in every process."""
 
     def __init__(self, cell: Cell, scene: SceneConfig, seed: int) -> None:
         self.cell = cell
@@ -71,12 +70,20 @@ class MotionPlanner:
         goal: Array | None = None,
         searches: int = MAX_SEARCHES,
     ) -> Path:
-        """Return the path of `move` from `start` (joints,), rad.
+        """Return the path of one move.
 
-        `attempt` counts tries in the same situation. With `goal` (joints,) the path ends there, so
-        that paths planned from there remain valid. `searches` as in `PathPlanner.plan`. Raises
-        `Refused`: UNREACHABLE when no configuration serves, NO_PATH when all are blocked, OVERLOAD
-        when the motors cannot carry the load along it.
+        Args:
+            move: Move to plan.
+            start: Configuration at the start, (joints,), rad.
+            situation: Poses of bodies and the held object.
+            attempt: Number of earlier tries in the same situation, which changes the random search.
+            goal: Required end, (joints,), rad, so that paths planned from there remain valid. None
+                finds one.
+            searches: See `PathPlanner.plan`.
+
+        Raises:
+            Refused: UNREACHABLE if no configuration serves, NO_PATH if all are blocked, OVERLOAD if
+                the motors cannot carry the load along the path.
         """
         self.lay_out(move, situation)
         if move.touches:
@@ -85,25 +92,29 @@ class MotionPlanner:
             goal = self.goal(move, start) if goal is None else goal
             clearance = self._clearance_at(start)
             first_blocked = self._with(clearance)
-            found = self.paths.plan(start, goal, first_blocked, attempt=attempt, searches=searches)
-            if found is None:
+            free_path = self.paths.plan(
+                start, goal, first_blocked, attempt=attempt, searches=searches
+            )
+            if free_path is None:
                 place = in_metres(self.ik.tool_at(goal))
-                why = self._why_no_path(start, goal, clearance)
-                raise Refused(Error.NO_PATH, f"{VERB_NAMES[move.verb]} to {place}: {why}")
-            path = found
+                reason = self._why_no_path(start, goal, clearance)
+                raise Refused(Error.NO_PATH, f"{VERB_NAMES[move.verb]} to {place}: {reason}")
+            path = free_path
         if situation.held is not None and situation.grip is not None:
             along = BlendedPath(*path).sample(LOAD_STEP_RAD)
             self.payloads.check_motors(situation.held, situation.grip, along)
         return path
 
     def lay_out(self, move: Move, situation: Situation) -> None:
-        """Set the collision checker to `situation` with the contacts that `move` intends."""
+        """Set the collision checker to `situation`, and permit the contacts that `move` intends."""
         touched = move.object if move.touches else None
         situation.lay_out(self.checker, touched)
 
     def goal(self, move: Move, start: Array) -> Array:
-        """Return the configuration at the end of a free motion, with the checker as it is set.
-        Raises `Refused`.
+        """Return the configuration at the end of a free motion, in the present situation.
+
+        Raises:
+            Refused: No configuration can be reached, or all are blocked.
         """
         if move.verb is Verb.MOVE_JOINTS:
             low, high = self.cell.limits.position.T
@@ -115,9 +126,9 @@ class MotionPlanner:
                 raise Refused(Error.UNREACHABLE, f"{where}; {valid}")
             return move.joints
         if move.posture:
-            near = self.ik.nearby(move.tool, move.joints)
-            if near is not None and self.checker.free(near):
-                return near
+            nearest = self.ik.nearby(move.tool, move.joints)
+            if nearest is not None and self.checker.free(nearest):
+                return nearest
         reference = move.joints if move.posture else start
         reachable = self.ik.reachable(move.tool, reference)
         name = VERB_NAMES[move.verb]
@@ -130,27 +141,30 @@ class MotionPlanner:
         raise Refused(Error.NO_PATH, f"{name} to {place}: {self.checker.why(reachable[0])}")
 
     def still_free(self, move: Move, path: Path, situation: Situation) -> bool:
-        """Return whether an earlier path of `move` can still be used in `situation`."""
+        """Return True if an earlier path of `move` can still be used in `situation`."""
         self.lay_out(move, situation)
         first_blocked = self._with(AHEAD_PART * self.clearance)
         return self.paths.blocked_at(path, first_blocked) is None
 
     def _with(self, clearance: float) -> FirstBlocked:
+        """Return the collision check for paths with a clearance, m."""
         return partial(self.checker.first_blocked, clearance=clearance)
 
     def _why_no_path(self, start: Array, goal: Array, clearance: float) -> str:
-        """Return why a free motion has no path: start or goal is blocked, or the obstacle on the
-        straight line.
+        """Explain why a free motion has no path.
+
+        The reason is a blocked start or goal, or the obstacle on the straight line between them.
         """
-        why = self.checker.why(start, clearance) or self.checker.why(goal, clearance)
-        if why:
-            return why
+        collision_text = self.checker.why(start, clearance) or self.checker.why(goal, clearance)
+        if collision_text:
+            return collision_text
         straight = Path(np.array([start, goal]), np.zeros(2))
         blocked = self.paths.blocked_at(straight, self._with(clearance))
-        found = self.checker.why(blocked, clearance) if blocked is not None else ""
-        return f"no path found around {found}" if found else "no path found"
+        obstacle = self.checker.why(blocked, clearance) if blocked is not None else ""
+        return f"no path found around {obstacle}" if obstacle else "no path found"
 
     def _line(self, move: Move, start: Array, goal: Array | None) -> Path:
+        """Plan a straight line of the tool, with the arguments of `plan`."""
         name = VERB_NAMES[move.verb]
         place = in_metres(move.tool)
         path = straight_line(self.ik, start, move.tool)
@@ -167,20 +181,22 @@ class MotionPlanner:
         return path
 
     def _clearance_at(self, start: Array) -> float:
-        """Return the scene's clearance, or less where an obstacle has come closer to the resting
-        arm.
-        """
-        room = self.checker.room(start)
-        return self.clearance if room >= self.clearance else max(CLOSE_PART * room, 0.0)
+        """Return the clearance of the scene, or less if an obstacle has come closer to the arm."""
+        available = self.checker.room(start)
+        return self.clearance if available >= self.clearance else max(CLOSE_PART * available, 0.0)
 
 
 def straight_line(ik: InverseKinematics, start: Array, target: Pose) -> Path | None:
-    """Return a path along which the tool moves straight from its pose at `start` (joints,) to
-    `target`.
+    """Return a path along which the tool moves straight to a target, or None.
 
-    The tool turns at a constant rate and strays at most `MAX_STRAY_M`. None when the line leaves
-    the reach of the arm, or continues only on another branch of the inverse kinematics. Collisions
-    are not checked.
+    The tool turns at a constant rate and deviates at most `MAX_DEVIATION_M`. There is no such path
+    if the line leaves the reach of the arm, or continues only on another branch of the inverse
+    kinematics. Collisions are not checked.
+
+    Args:
+        ik: Inverse kinematics of the arm.
+        start: Configuration at the start, (joints,), rad.
+        target: Pose of the tool at the end.
     """
     begin = ik.tool_at(start)
     for lines in LINES:
@@ -191,7 +207,7 @@ def straight_line(ik: InverseKinematics, start: Array, target: Pose) -> Path | N
                 break
             points.append(q)
         else:
-            # Every corner is rounded by half of the shorter adjacent line: the motion never stops.
+            # Blends take half of the shorter adjacent line, so the motion never stops.
             lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
             blend = np.zeros(len(points))
             blend[1:-1] = 0.5 * np.minimum(lengths[:-1], lengths[1:])
@@ -202,19 +218,19 @@ def straight_line(ik: InverseKinematics, start: Array, target: Pose) -> Path | N
 
 
 def _stray(ik: InverseKinematics, path: Path, begin: Pose, target: Pose) -> float:
-    """Return the largest distance of the tool from the straight line, in m."""
+    """Return the largest distance of the tool from the straight line, m."""
     blended = BlendedPath(*path)
     if blended.length == 0.0:
         return 0.0
-    way = target.position - begin.position
-    length = norm(way)
+    line = target.position - begin.position
+    length = norm(line)
     samples = blended.sample(blended.length / (STRAY_SAMPLES * (len(path.waypoints) - 1)))
-    off = np.array([ik.tool_at(q).position - begin.position for q in samples])
+    deviations = np.array([ik.tool_at(q).position - begin.position for q in samples])
     if length > 0.0:
-        off -= np.outer(mat_vec(off, way) / length**2, way)
-    return float(np.max(np.linalg.norm(off, axis=1)))
+        deviations -= np.outer(mat_vec(deviations, line) / length**2, line)
+    return float(np.max(np.linalg.norm(deviations, axis=1)))
 
 
 def in_metres(tool: Pose) -> str:
-    """Return a position as text, in m."""
+    """Format the position of a tool, in m."""
     return "[{:.3f}, {:.3f}, {:.3f}]".format(*tool.position)

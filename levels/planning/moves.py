@@ -12,15 +12,8 @@ from rack.levels.messages import TaskCommand, TaskPlan, Verb
 from rack.levels.planning.collision import CollisionChecker
 from rack.levels.planning.pose import Pose, pose
 
-VERB_NAMES = {
-    Verb.NONE: "rest",
-    Verb.MOVE: "move",
-    Verb.MOVE_JOINTS: "move",
-    Verb.APPROACH: "approach",
-    Verb.GRASP: "grasp",
-    Verb.DEPART: "depart",
-    Verb.RELEASE: "release",
-}
+VERB_NAMES = {verb: verb.name.lower() for verb in Verb}
+VERB_NAMES |= {Verb.NONE: "rest", Verb.MOVE_JOINTS: "move"}
 
 
 class Move(NamedTuple):
@@ -30,19 +23,19 @@ class Move(NamedTuple):
     action: int
     verb: Verb
     object: int | None  # row in the world model
-    tool: Pose  # of the tool at the end
+    tool: Pose  # pose of the tool at the end
     joints: Array  # (joints,), rad
-    posture: bool  # of the configurations at `tool`, the one nearest to `joints` is wanted
-    by_s: float  # simulated time by which it must be done, s; 0: no such time
+    posture: bool  # the configuration must be the one nearest to `joints`
+    by_s: float  # simulated time by which the move must be done, s, or 0
 
     @property
     def is_motion(self) -> bool:
-        """True when the arm moves and a path is needed; False for the gripper."""
+        """True if the arm moves and needs a path. False if only the gripper moves."""
         return self.verb not in (Verb.GRASP, Verb.RELEASE)
 
     @property
     def touches(self) -> bool:
-        """True when the object that is held, or is about to be grasped, may touch its support."""
+        """True if the object that is held or about to be grasped may touch its support."""
         return self.verb in (Verb.APPROACH, Verb.DEPART)
 
     def write_to(self, record: Any) -> None:
@@ -79,15 +72,15 @@ def read_window(command: TaskCommand | TaskPlan) -> list[Move]:
 
 @dataclass(frozen=True)
 class Situation:
-    """The poses of bodies and the object in the gripper: now, or once the moves ahead are done."""
+    """Poses of the bodies and the object in the gripper, now or after future moves."""
 
-    positions: Array  # (bodies, 3), m: the rows of the world model
+    positions: Array  # (bodies, 3), m, by row of the world model
     quaternions: Array  # (bodies, 4), as w, x, y, z
-    held: int | None = None  # row of the object in the gripper
-    grip: Pose | None = None  # its pose in the tool's frame
+    held: int | None = None  # row of the object in the gripper, or None
+    grip: Pose | None = None  # pose of that object in the frame of the tool
 
     def object_pose(self, row: int) -> Pose:
-        """Return the pose of object `row` in the world model."""
+        """Return the pose of object `row`."""
         return Pose(self.positions[row], self.quaternions[row])
 
     def after(self, move: Move) -> Situation:
@@ -99,20 +92,23 @@ class Situation:
         return self
 
     def holding(self, row: int | None, grip: Pose | None) -> Situation:
-        """Return this situation with object `row` in the gripper at `grip` in the tool's frame;
-        None: nothing held.
+        """Return this situation with another object in the gripper.
+
+        Args:
+            row: Row of the object, or None for an empty gripper.
+            grip: Pose of the object in the frame of the tool.
         """
         return replace(self, held=row, grip=grip)
 
-    def with_body(self, row: int, at: Pose) -> Situation:
+    def with_body(self, row: int, pose: Pose) -> Situation:
         """Return this situation with body `row` at another pose."""
         positions = self.positions.copy()
         quaternions = self.quaternions.copy()
-        positions[row], quaternions[row] = at
+        positions[row], quaternions[row] = pose
         return replace(self, positions=positions, quaternions=quaternions)
 
     def lay_out(self, checker: CollisionChecker, touched: int | None) -> None:
-        """Set `checker` to this situation; object `touched` may touch supports and gripper."""
+        """Set `checker` to this situation. Object `touched` may touch supports and gripper."""
         checker.place(self.positions, self.quaternions)
         if self.held is None or self.grip is None:
             checker.hold(None)

@@ -1,9 +1,8 @@
-"""Collision-free paths between two configurations: straight where that is free, else sampled, with
-rounded corners.
+"""Collision-free paths between two configurations, with rounded corners.
 
-The search is OMPL's RRTConnect, then short cuts. It ends by the number of configurations checked,
-never by time, and every call seeds the random numbers anew: equal arguments give equal paths, in
-every process.
+A path is straight where that is free. Otherwise OMPL's RRTConnect searches one and shortens it. The
+search ends after a number of checks, never by time, and every call seeds the random numbers. So
+equal arguments give equal paths in every process.
 """
 
 from __future__ import annotations
@@ -24,49 +23,48 @@ from rack.levels.robot.cell import Cell
 from rack.levels.robot.lookup import below, geoms_of
 
 Free = Callable[[Array], bool]
-"""Returns whether all of some configurations (n, joints) are free."""
+"""Returns True if all of the configurations (n, joints) are free."""
 FirstBlocked = Callable[[Array], int]
-"""Returns the index of the first of configurations (n, joints), rad, that is not free; n: all
-are."""
+"""Returns the index of the first of n configurations, (n, joints), rad, that is not free, or n."""
 
 MAX_CHECKS = 24_000
-"""Configurations checked by all searches of a plan together: this bounds its time."""
+"""Maximum number of configurations checked by all searches of a plan, which bounds its time."""
 MAX_SEARCHES = 6
-"""Searches of one plan, each with its own seed; the quickest path found is taken."""
+"""Maximum number of searches of one plan, each with another seed. The quickest path is taken."""
 MAX_SEED = 2**31 - 1
 STEP_PART = 0.5
-"""No point of the arm moves farther between two checks than this part of the clearance."""
+"""Part of the clearance that any point of the arm moves at most between two checks."""
 MIN_LEVER_M = 0.05
-"""Least weight of a joint in the metric, for joints that hardly move any geom."""
+"""Minimum weight of a joint in the metric, for joints that hardly move any geom."""
 LEVER_SAMPLES = 64
-"""Random configurations over which the longest lever is taken."""
+"""Number of random configurations in which lever arms are measured."""
 BLENDS = (1.0, 0.6, 0.35, 0.2, 0.1)
-"""Parts of the largest blend that are tried at a corner; when all collide, the motion stops
-there."""
+"""Parts of the largest blend that are tried at a corner. If all collide, the motion stops at the
+corner."""
 END_PART = 0.9
-"""Part of the first and the last line that a blend may take."""
+"""Part of the first and of the last line that a blend may use."""
 BRANCH_PART = 0.2
-"""Longest branch of the tree, as a part of the space's extent."""
+"""Longest branch of the search tree, as a part of the extent of the space."""
 ENDLESS_RAD = 2.0 * np.pi
-"""Range beyond start and goal of a joint without limits."""
+"""Range of the search beyond start and goal for a joint without limits."""
 BOUND_ROUNDING = 1e-9
-"""Margin of the space's bounds, in scaled length, so that start and goal are inside in spite of
-rounding."""
+"""Margin of the bounds of the space, in scaled length, so that rounding does not exclude start or
+goal."""
 
 util.setLogLevel(util.LOG_NONE)
 
 
 class PathPlanner:
-    """Plans paths for one arm. Pure: equal arguments give equal paths."""
+    """Plans paths for one arm. Equal arguments give equal paths."""
 
     def __init__(self, cell: Cell, clearance: float, seed: int) -> None:
         self._limits = cell.limits
         self._seed = seed
         self._levers = np.maximum(lever_arms(cell, seed), MIN_LEVER_M)
-        # sum |lever_j dq_j| <= |lever| |dq|: a step of this length moves no point farther than
-        # intended.
+        # Because sum |lever_j dq_j| <= |lever| |dq|, a step of this length moves no point farther
+        # than intended.
         self.step_rad = STEP_PART * clearance / norm(self._levers)
-        # Of scaled length between two checks.
+        # Scaled length between two checks.
         self._resolution = STEP_PART * clearance / float(np.sqrt(len(self._levers)))
 
     def plan(
@@ -78,10 +76,15 @@ class PathPlanner:
         attempt: int = 0,
         searches: int = MAX_SEARCHES,
     ) -> Path | None:
-        """Return the quickest path found from `start` to `goal` (joints,), rad, or None.
+        """Return the quickest path found, or None.
 
-        Another `attempt` uses other random numbers, for another try in the same world. With fewer
-        `searches` the path is found sooner and is never quicker than with more.
+        Args:
+            start: Configuration at the start, (joints,), rad.
+            goal: Configuration at the end, (joints,), rad.
+            first_blocked: Finds the first configuration that is not free.
+            attempt: Selects other random numbers, for another try in the same world.
+            searches: Number of paths to find. With fewer, the result comes sooner but is never
+                quicker.
         """
         ends = np.array([start, goal])
         if first_blocked(ends) < len(ends):
@@ -97,45 +100,62 @@ class PathPlanner:
 
     def rounded(self, waypoints: Array, first_blocked: FirstBlocked) -> Path:
         """Return the path along `waypoints`, with each corner rounded as far as it stays free."""
-        # Blends must not overlap: up to half of an inner line, most of the first and the last.
+        # Blends must not overlap: they use up to half of an inner line, and most of the first and
+        # the last line.
         lengths = np.linalg.norm(np.diff(waypoints, axis=0), axis=1)
-        room = 0.5 * lengths
-        room[[0, -1]] = END_PART * lengths[[0, -1]] if len(lengths) > 1 else 0.0
+        largest_blends = 0.5 * lengths
+        largest_blends[[0, -1]] = END_PART * lengths[[0, -1]] if len(lengths) > 1 else 0.0
         blend = np.zeros(len(waypoints))
-        blend[1:-1] = np.minimum(room[:-1], room[1:])
+        blend[1:-1] = np.minimum(largest_blends[:-1], largest_blends[1:])
         for corner in range(1, len(waypoints) - 1):
             largest = float(blend[corner])
             blend[corner] = self._free_blend(waypoints, corner, largest, first_blocked)
         return Path(waypoints, blend)
 
     def blocked_at(self, path: Path, first_blocked: FirstBlocked) -> Array | None:
-        """Return the first configuration on `path` that is not free; None when all are."""
+        """Return the first configuration on `path` that is not free, or None."""
         samples = BlendedPath(*path).sample(self.step_rad)
-        found = first_blocked(samples)
-        return samples[found] if found < len(samples) else None
+        index = first_blocked(samples)
+        return samples[index] if index < len(samples) else None
 
     def duration(self, path: Path) -> float:
-        """Return the time of `path`, rest to rest, in s."""
+        """Return the duration of `path`, from rest to rest, s."""
         return make_trajectory(BlendedPath(*path), self._limits).duration
 
     def _sampled(
         self, ends: Array, first_blocked: FirstBlocked, attempt: int, searches: int
     ) -> list[Path]:
+        """Search paths around obstacles until enough are found, or the checks are used up.
+
+        Args:
+            ends: Start and goal, (2, joints), rad.
+            first_blocked: Finds the first configuration that is not free.
+            attempt: Selects the random numbers.
+            searches: Number of paths to find.
+        """
         paths: list[Path] = []
-        left = MAX_CHECKS
+        checks_left = MAX_CHECKS
         for k in range(MAX_SEARCHES):
             seed = 1 + (self._seed + attempt * MAX_SEARCHES + k) % MAX_SEED
-            polyline, checks = self._search(ends, first_blocked, seed, left)
-            left -= checks
+            polyline, checks = self._search(ends, first_blocked, seed, checks_left)
+            checks_left -= checks
             if polyline is not None and len(polyline) <= WAYPOINTS:
                 paths.append(self.rounded(polyline, first_blocked))
-            if left <= 0 or len(paths) == searches:
+            if checks_left <= 0 or len(paths) == searches:
                 break
         return paths
 
     def _free_blend(
         self, waypoints: Array, corner: int, largest: float, first_blocked: FirstBlocked
     ) -> float:
+        """Return the largest free blend at a corner, rad, or 0.
+
+        Args:
+            waypoints: Waypoints of the path, (n, joints), rad.
+            corner: Index of the corner.
+            largest: Largest blend to try, rad.
+            first_blocked: Finds the first configuration that is not free.
+        """
         before, at, after = waypoints[corner - 1 : corner + 2]
         for part in BLENDS:
             b = part * largest
@@ -148,21 +168,28 @@ class PathPlanner:
     def _search(
         self, ends: Array, first_blocked: FirstBlocked, seed: int, budget: int
     ) -> tuple[Array | None, int]:
-        """Search joint space, scaled by the levers, between `ends` (2, joints), rad; return a free
-        polyline (k, joints), or None, and the number of configurations checked.
+        """Search a free polyline in joint space scaled by the lever arms.
 
-        `budget` bounds the checks of the search; the short cuts add a few.
+        Args:
+            ends: Start and goal, (2, joints), rad.
+            first_blocked: Finds the first configuration that is not free.
+            seed: Seed of the random numbers.
+            budget: Maximum number of checks of the search; the short cuts add a few.
+
+        Returns:
+            Polyline, (k, joints), rad, or None, and the number of configurations checked.
         """
         util.RNG.setSeed(seed)
         count = 0
 
-        def free(scaled: Array) -> bool:
+        def is_free(scaled: Array) -> bool:
+            """Check scaled configurations, and count the checks."""
             nonlocal count
-            found = first_blocked(scaled / self._levers)
-            count += min(found + 1, len(scaled))
-            return found == len(scaled)
+            index = first_blocked(scaled / self._levers)
+            count += min(index + 1, len(scaled))
+            return index == len(scaled)
 
-        information = self._space(ends, free)
+        information = self._space(ends, is_free)
         problem = base.ProblemDefinition(information)
         problem.setStartAndGoalStates(*(self._state(information, end) for end in ends))
         planner = geometric.RRTConnect(information)
@@ -179,11 +206,12 @@ class PathPlanner:
         simplifier.collapseCloseVertices(path)
         simplifier.reduceVertices(path)
         polyline = self._values(*path.getStates()) / self._levers
-        # Scaling there and back rounds: restore the exact ends.
+        # Scaling introduces rounding errors, so restore the exact ends.
         polyline[[0, -1]] = ends
         return polyline, count
 
     def _space(self, ends: Array, free: Free) -> base.SpaceInformation:
+        """Build the scaled space of OMPL around `ends`, (2, joints), with its collision check."""
         least = ends.min(axis=0)
         most = ends.max(axis=0)
         low, high = self._limits.position.T
@@ -191,7 +219,7 @@ class PathPlanner:
         high = np.where(np.isfinite(high), high, most + ENDLESS_RAD)
         space = base.RealVectorStateSpace(len(least))
         bounds = base.RealVectorBounds(len(least))
-        # The arm may rest slightly beyond a limit: the start counts as inside.
+        # The arm may rest slightly beyond a limit, so the bounds include the start.
         for j, value in enumerate(np.minimum(low, least) * self._levers - BOUND_ROUNDING):
             bounds.setLow(j, value)
         for j, value in enumerate(np.maximum(high, most) * self._levers + BOUND_ROUNDING):
@@ -205,48 +233,56 @@ class PathPlanner:
         return information
 
     def _state(self, information: base.SpaceInformation, q: Array) -> base.State:
+        """Return the OMPL state of configuration `q`, (joints,), rad."""
         state = information.allocState()
         for j, value in enumerate(q * self._levers):
             state[j] = value
         return state
 
     def _values(self, *states: base.State) -> Array:
-        """Return the scaled values of states, (states, joints)."""
+        """Return the scaled values of OMPL states, (states, joints)."""
         joints = range(len(self._levers))
         return np.array([[state[j] for j in joints] for state in states])
 
 
 class MotionCheck(base.MotionValidator):  # type: ignore[misc]  # untyped
-    """Checks a motion where, and in the order in which, OMPL's own validator does, but with one
-    call for all places: a call each took longer than the checks.
+    """Checks motions in the same order as OMPL's own validator, but with one call per motion.
+
+    A separate call for each configuration took longer than the checks themselves.
     """
 
     def __init__(
         self, information: base.SpaceInformation, values: Callable[..., Array], free: Free
     ) -> None:
         super().__init__(information)
-        # Not `information`, which holds this object: nothing would free the two.
+        # Keeping `information`, which refers to this object, would make a cycle that nothing frees.
         self._space = information.getStateSpace()
         self._values = values
         self._free = free
 
     def checkMotion(self, one: base.State, other: base.State) -> bool:  # noqa: N802  # OMPL's name
-        """Return whether the motion from `one`, known to be free, to `other` is free."""
+        """Return True if the motion from `one`, which is known to be free, to `other` is free."""
         count = max(self._space.validSegmentCount(one, other), 1)
         return self._free(halved.load()(self._values(one, other), count))
 
 
 @compiled_for("f8[:,::1], i8")
 def halved(ends: Array, count: int) -> Array:
-    """Return the places at which a line between `ends` (2, joints) in `count` parts is checked,
-    (count, joints): its end, its middle, the middles of the halves, and so on.
+    """Return the points at which a line is checked: its end, its middle, and so on by halves.
+
+    Args:
+        ends: Ends of the line, (2, joints).
+        count: Number of parts of the line.
+
+    Returns:
+        Points, (count, joints), in the order of checking.
     """
     places = np.empty((count, ends.shape[1]))
     places[0] = ends[1]
-    # First and last mark of each stretch whose middle is a place.
+    # First and last index of each stretch whose middle becomes a point.
     stretches = np.empty((count + 1, 2), dtype=np.int64)
     stretches[1] = 1, count - 1
-    known = 2
+    stretch_count = 2
     for k in range(1, count):
         first, last = stretches[k]
         middle = (first + last) // 2
@@ -254,16 +290,22 @@ def halved(ends: Array, count: int) -> Array:
             places[k, j] = ends[0, j] + (ends[1, j] - ends[0, j]) * (middle / count)
         for half in ((first, middle - 1), (middle + 1, last)):
             if half[0] <= half[1]:
-                stretches[known] = half
-                known += 1
+                stretches[stretch_count] = half
+                stretch_count += 1
     return places
 
 
 def lever_arms(cell: Cell, seed: int) -> Array:
-    """Return (joints,): the farthest that 1 rad (or 1 m) of each joint moves any geom that it
-    carries, in m.
+    """Return how far each joint can move any geom of the arm, per rad or per m.
 
     A joint step dq moves no point of the arm by more than sum |lever_j dq_j|.
+
+    Args:
+        cell: Model of the arm.
+        seed: Seed of the random configurations that are measured.
+
+    Returns:
+        Lever arms, (joints,), m.
     """
     m = cell.model
     data = mujoco.MjData(m)
@@ -278,7 +320,8 @@ def lever_arms(cell: Cell, seed: int) -> Array:
         anchors[sample] = data.xanchor
         axes[sample] = data.xaxis
 
-    def lever(joint: int) -> float:
+    def measure_lever(joint: int) -> float:
+        """Return the lever arm of one joint."""
         if m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE:
             return 1.0
         carried = geoms_of(m, below(m, m.jnt_bodyid[[joint]]))
@@ -287,4 +330,4 @@ def lever_arms(cell: Cell, seed: int) -> Array:
         from_axis = np.linalg.norm(np.cross(from_anchor, axes[:, [joint]]), axis=2)
         return float(np.max(from_axis + m.geom_rbound[moved], initial=0.0))
 
-    return np.array([lever(joint) for joint in m.dof_jntid[cell.dof]])
+    return np.array([measure_lever(joint) for joint in m.dof_jntid[cell.dof]])

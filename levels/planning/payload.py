@@ -1,16 +1,16 @@
-"""Whether the arm can carry an object, and a jaw that stands still.
+"""Checks whether the arm can carry an object, and handles grippers with a fixed jaw.
 
 The weight of an object is compared with the friction of the grip and the torques of the motors. The
-grip is known if a straight line through the tool's origin, along its y axis, hits the object and a
-finger on either side, as in every grasp that the task level plans. Virtual work over the linkage,
-of any kind, gives the force there from the actuator's. If the line misses, the grip is unknown and
-only the motors are checked.
+grip is known if a straight line through the origin of the tool, along its y axis, hits the object
+and a finger on either side, as in every grasp that the task level plans. Virtual work over the
+linkage, of any kind, gives the grip force from the actuator's force. If the line misses, the grip
+is unknown and only the motors are checked.
 
-Where one finger closes on a jaw that stands still, a grasp brings the tool so far aside that the
-jaw is next to the object, and the finger does not push it far. The jaw is that part of the gripper,
-unmoved by its joint, which the same line meets on one side. Distances are those of MuJoCo's
-contacts, which know meshes by their hulls: a jaw whose hull slants meets an object with an edge,
-and that counts.
+Some grippers have one moving finger and a fixed jaw. For these, a grasp moves the tool sideways
+until the jaw is next to the object, so that the finger does not push the object far. The jaw is the
+part of the gripper which its joint does not move and which the same line hits on one side.
+Distances are measured as for MuJoCo's contacts, with the convex hulls of meshes, so a jaw with a
+slanted hull touches an object with an edge.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import Dynamics, Payload
 
 MIN_GRIP_FACTOR = 1.5
-"""Grip required per weight of an object, to hold it while the arm accelerates: the PUMA loses one
-at 1.22."""
+"""Required grip as a multiple of an object's weight, to hold it while the arm accelerates. The PUMA
+loses an object at 1.22."""
 MAX_MOTOR_PART = 0.9
-"""Part of a motor's torque that weights may take: the rest moves the arm."""
+"""Part of a motor's torque that weights may use. The rest moves the arm."""
 RAY_RANGE_M = 1.0
-"""Fingers and surfaces are searched up to this distance from the tool."""
+"""Distance from the tool up to which fingers and surfaces are searched."""
 SIDES = (1.0, -1.0)
 
 
@@ -44,11 +44,11 @@ class Jaws(NamedTuple):
     opening: float  # m or rad
     gap: float  # between the fingers, m
     length: float  # of the actuator, m or rad
-    geoms: tuple[int, int]  # that face each other
+    geoms: tuple[int, int]  # ids of the geoms that face each other
 
 
 class Payloads:
-    """Checks the payloads of one arm. `names` are the objects by their rows."""
+    """Checks the payloads of one arm. `names` are the objects by row."""
 
     def __init__(self, cell: Cell, names: tuple[str, ...]) -> None:
         self._cell = cell
@@ -59,19 +59,28 @@ class Payloads:
         self.jaws = self._closing()
 
     def check_grip(self, row: int, grip: Pose) -> None:
-        """Raise `Refused` with both forces if friction does not hold object `row` at `grip` in the
-        tool's frame.
+        """Check that friction can hold an object at `grip`, its pose in the frame of the tool.
+
+        Raises:
+            Refused: The grip is too weak; the text contains both forces.
         """
         gravity = float(np.sqrt(np.sum(np.square(self._cell.model.opt.gravity))))
         needed = MIN_GRIP_FACTOR * self._mass(row) * gravity
         holds = self._holding_force(row, grip)
         if holds is not None and holds < needed:
-            why = f"{needed:.1f} N of grip; the gripper holds {holds:.1f} N"
-            raise Refused(Error.OVERLOAD, f"payload {self._named(row)} needs {why}")
+            shortage = f"{needed:.1f} N of grip; the gripper holds {holds:.1f} N"
+            raise Refused(Error.OVERLOAD, f"payload {self._named(row)} needs {shortage}")
 
     def check_motors(self, row: int, grip: Pose, configurations: Array) -> None:
-        """Raise `Refused` with both torques if a motor cannot carry object `row` at one of (k,
-        joints), rad.
+        """Check that the motors can carry an object.
+
+        Args:
+            row: Row of the object.
+            grip: Pose of the object in the frame of the tool.
+            configurations: Configurations to check, (k, joints), rad.
+
+        Raises:
+            Refused: A motor is too weak; the text contains both torques.
         """
         model = self._cell.model
         centre = grip @ pose(model.body_ipos[self._cell.bodies[row]], (1.0, 0.0, 0.0, 0.0))
@@ -82,30 +91,32 @@ class Payloads:
             worst = int(np.argmax(load - limit))
             if load[worst] > limit[worst]:
                 joint = self._cell.joints[worst]
-                why = (
+                shortage = (
                     f"{load[worst]:.1f} N m of '{joint}'; its motor carries {limit[worst]:.1f} N m"
                 )
-                raise Refused(Error.OVERLOAD, f"payload {self._named(row)} needs {why}")
+                raise Refused(Error.OVERLOAD, f"payload {self._named(row)} needs {shortage}")
 
     def _mass(self, row: int) -> float:
+        """Return the mass of object `row`, kg."""
         return float(self._cell.model.body_subtreemass[self._cell.bodies[row]])
 
     def _named(self, row: int) -> str:
+        """Format name and mass of object `row`."""
         return f"'{self._names[row]}' {self._mass(row):.3g} kg"
 
     def _holding_force(self, row: int, grip: Pose) -> float | None:
-        """Return the friction, N, that can carry object `row`; None: unknown."""
+        """Return the friction force that can carry object `row`, N, or None if it is unknown."""
         width = self._width(row, grip)
-        # The last jaws that are wider, and the first that are not.
-        around = (pair for pair in pairwise(self.jaws) if pair[0].gap > width >= pair[1].gap)
-        wide, narrow = next(around, (None, None))
+        # Find the last jaws that are wider than the object, and the first that are not.
+        pairs = (pair for pair in pairwise(self.jaws) if pair[0].gap > width >= pair[1].gap)
+        wide, narrow = next(pairs, (None, None))
         if wide is None or narrow is None:
             return None
         model = self._cell.model
         gripper = self._cell.gripper
         assert gripper is not None, "there are jaws"
-        most = float(model.actuator_forcerange[gripper.actuator, 1])
-        force = min(most, gripper.stiffness * abs(narrow.opening - gripper.closed))
+        max_force = float(model.actuator_forcerange[gripper.actuator, 1])
+        force = min(max_force, gripper.stiffness * abs(narrow.opening - gripper.closed))
         normal = force * abs(wide.length - narrow.length) / (wide.gap - narrow.gap)
         parts = self._cell.parts(row)
         return normal * sum(
@@ -113,16 +124,14 @@ class Payloads:
         )
 
     def _width(self, row: int, grip: Pose) -> float:
-        """Return the width of the object on the line through the tool, m; -inf: the line misses
-        it.
-        """
+        """Return the width of the object on the line through the tool, m, or -inf if it misses."""
         cell = self._cell
         data = self._data
         address = cell.object_qpos[row]
         tool = pose(*site_pose(data, cell.tool))
         data.qpos[address : address + 7] = np.concatenate(tool @ grip)
         mujoco.mj_kinematics(cell.model, data)
-        parts = self._cell.parts(row)
+        parts = cell.parts(row)
         return sum(
             RAY_RANGE_M - self._nearest(parts, RAY_RANGE_M * side, -side)[0] for side in SIDES
         )
@@ -142,11 +151,11 @@ class Payloads:
             cell.gripper_geoms,
             np.flatnonzero(cell.model.geom_bodyid == cell.model.body_parentid[hand]),
         )
-        # A single finger closes on a jaw of the body that carries it.
+        # A single finger closes on a jaw of the body that carries the finger.
         return self._jaws_of(fingers, openings) or self._jaws_of(cell.gripper_geoms, openings)
 
     def _jaws_of(self, fingers: Ints, openings: Array) -> list[Jaws]:
-        """Return the jaws that geoms make at these openings, while there are any."""
+        """Return the jaws that some geoms form at these openings, as long as there is a gap."""
         cell = self._cell
         data = self._data
         gripper = cell.gripper
@@ -157,25 +166,31 @@ class Payloads:
             mujoco.mj_fwdPosition(cell.model, data)
             sides = [self._nearest(fingers, 0.0, side) for side in SIDES]
             gap = sides[0][0] + sides[1][0]
-            # When closed, the tool's origin is inside a finger, and the line leaves it on the far
-            # side.
+            # When closed, the tool's origin is inside a finger, and the line hits its far side.
             if not np.isfinite(gap) or (jaws and gap >= jaws[-1].gap):
                 break
             length = float(data.actuator_length[gripper.actuator])
             jaws.append(Jaws(float(opening), gap, length, (sides[0][1], sides[1][1])))
         return jaws
 
-    def _nearest(self, geoms: Ints, start: float, way: float) -> tuple[float, int]:
-        """Return distance, m, and id of the first geom on the tool's y axis from `start`, m; inf:
-        none.
+    def _nearest(self, geoms: Ints, start: float, direction: float) -> tuple[float, int]:
+        """Find the first geom that a ray along the y axis of the tool hits.
+
+        Args:
+            geoms: Ids of the geoms to test.
+            start: Start of the ray on that axis, m.
+            direction: Direction of the ray, 1 or -1.
+
+        Returns:
+            Distance, m, and id of the geom. The distance is inf if the ray hits none.
         """
         model = self._cell.model
         data = self._data
         tool = self._cell.tool
         axis = data.site_xmat[tool].reshape(3, 3)[:, 1].copy()
         begin = data.site_xpos[tool] + start * axis
-        along = way * axis
-        found = (np.inf, -1)
+        along = direction * axis
+        nearest = (np.inf, -1)
         for geom in geoms:
             kind = int(model.geom_type[geom])
             if kind == mujoco.mjtGeom.mjGEOM_MESH:
@@ -184,15 +199,13 @@ class Payloads:
                 at = data.geom_xpos[geom]
                 turned = data.geom_xmat[geom]
                 distance = mujoco.mju_rayGeom(at, turned, model.geom_size[geom], begin, along, kind)
-            if 0.0 <= distance < found[0]:
-                found = (float(distance), int(geom))
-        return found
+            if 0.0 <= distance < nearest[0]:
+                nearest = (float(distance), int(geom))
+        return nearest
 
 
 def _friction(model: mujoco.MjModel, one: int, other: int) -> float:
-    """Return the sliding friction of a contact of two geoms, as MuJoCo mixes it; 0:
-    frictionless.
-    """
+    """Return the sliding friction of two geoms, as MuJoCo combines it. 0 if frictionless."""
     if model.geom_priority[one] == model.geom_priority[other]:
         mixed = [one, other]
     elif model.geom_priority[one] > model.geom_priority[other]:
@@ -205,46 +218,56 @@ def _friction(model: mujoco.MjModel, one: int, other: int) -> float:
 
 
 GAP_M = 0.002
-"""Between jaw and object before the finger closes: at 0 the jaw could come down on its edge."""
+"""Gap between jaw and object before the finger closes. At 0 the jaw could land on the object."""
 FARTHEST_M = 0.2
-"""From the tool: where the search begins, and where it ends on the jaw's side."""
+"""Distance from the tool at which the search begins, and ends on the side of the jaw."""
 NEAR_M = 1e-4
-"""At this distance from the jaw the search ends."""
+"""Distance from the jaw at which the search ends."""
 STEPS = 200
+"""Maximum number of steps of the search."""
 MOVED = 1e-6
-"""In a pose, from open to closed: rounding."""
+"""Change in a pose, from open to closed, up to which a geom counts as fixed."""
 
 
 class FixedJaw:
-    """The jaw of a cell's gripper, and the geoms that stand still with it."""
+    """The jaw of a gripper that does not move, and the geoms that are fixed to it."""
 
     def __init__(self, cell: Cell, geoms: Ints, side: float) -> None:
         self._cell = cell
         self._geoms = geoms
-        self._side = side  # of the tool's y axis: 1 or -1
+        self._side = side  # side of the jaw on the y axis of the tool, 1 or -1
         self._data = cell.start()
 
-    def beside(self, tool: Pose, row: int, seen: Pose) -> Pose:
-        """Return the pose of a tool that is to take object `row`, `seen` in the world, moved along
-        its y axis until the jaw is next to the object.
+    def beside(self, tool: Pose, row: int, object_pose: Pose) -> Pose:
+        """Move the pose of a tool along its y axis until the jaw is next to the object to grasp.
+
+        Args:
+            tool: Pose of the tool for the grasp.
+            row: Row of the object.
+            object_pose: Pose of the object in the world.
+
+        Returns:
+            The moved pose, or `tool` if the jaw does not meet the object.
         """
-        here = site_pose(self._data, self._cell.tool)
-        relative = here @ tool.inverse() @ seen
+        present_tool = site_pose(self._data, self._cell.tool)
+        relative = present_tool @ tool.inverse() @ object_pose
         along = self._side * self._data.site_xmat[self._cell.tool].reshape(3, 3)[:, 1]
-        way = -FARTHEST_M
+        travel = -FARTHEST_M
         for _ in range(STEPS):
-            room = self._distance(row, Pose(relative.position + way * along, relative.quaternion))
-            way += room
-            if room < NEAR_M or way > FARTHEST_M:
+            distance = self._distance(
+                row, Pose(relative.position + travel * along, relative.quaternion)
+            )
+            travel += distance
+            if distance < NEAR_M or travel > FARTHEST_M:
                 break
-        if way > FARTHEST_M:
+        if travel > FARTHEST_M:
             return tool
         across = np.zeros(3)
         mujoco.mju_rotVecQuat(across, np.array([0.0, self._side, 0.0]), tool.quaternion)
-        return Pose(tool.position - (way - GAP_M) * across, tool.quaternion)
+        return Pose(tool.position - (travel - GAP_M) * across, tool.quaternion)
 
     def _distance(self, row: int, at: Pose) -> float:
-        """Return the distance of object `row` from what stands still, m; 0: they touch."""
+        """Return the distance of object `row` from the fixed geoms, m, or 0 if they touch."""
         model = self._cell.model
         data = self._data
         address = self._cell.object_qpos[row]
@@ -259,7 +282,7 @@ class FixedJaw:
 
 
 def find_fixed_jaw(cell: Cell, payloads: Payloads) -> FixedJaw | None:
-    """Return the jaw that stands still; None: both sides of the gripper move, or it has none."""
+    """Return the fixed jaw of the gripper, or None if both sides move or there is no gripper."""
     gripper = cell.gripper
     if gripper is None or not payloads.jaws:
         return None
@@ -270,11 +293,11 @@ def find_fixed_jaw(cell: Cell, payloads: Payloads) -> FixedJaw | None:
         mujoco.mj_kinematics(cell.model, data)
         poses.append(np.hstack((data.geom_xpos, data.geom_xmat)))
     is_still = np.abs(poses[0] - poses[1]).max(axis=1) < MOVED
-    still = [
+    fixed_sides = [
         side for side, geom in zip(SIDES, payloads.jaws[0].geoms, strict=True) if is_still[geom]
     ]
-    if len(still) != 1:
+    if len(fixed_sides) != 1:
         return None
     solid = (cell.model.geom_contype | cell.model.geom_conaffinity) != 0
     geoms = cell.gripper_geoms
-    return FixedJaw(cell, geoms[is_still[geoms] & solid[geoms]], still[0])
+    return FixedJaw(cell, geoms[is_still[geoms] & solid[geoms]], fixed_sides[0])

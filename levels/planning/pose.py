@@ -1,4 +1,4 @@
-"""Poses: position and orientation."""
+"""Poses: position and orientation of a body, the tool or a frame."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rack.levels.algebra import Array, norm
 MAX_DIFFERENCE = 1e-6
 """Poses closer than this, in m and in rad, count as equal."""
 MAX_PARALLEL_SINE = 1e-9
-"""Two unit directions whose cross product is shorter than this count as parallel."""
+"""Two unit vectors whose cross product is shorter than this count as parallel."""
 
 
 class Pose(NamedTuple):
@@ -24,43 +24,45 @@ class Pose(NamedTuple):
     quaternion: Array  # (4,), unit length, as w, x, y, z
 
     def __matmul__(self, inner: Pose) -> Pose:
-        """Return the composition: `inner` is given in the frame that this pose places."""
+        """Return the composition: `inner`, which is relative to this pose, in the outer frame."""
         position = np.zeros(3)
         quaternion = np.zeros(4)
         mujoco.mju_mulPose(position, quaternion, *self, *inner)
         return Pose(position, quaternion)
 
     def inverse(self) -> Pose:
-        """Return the inverse."""
+        """Return the pose of the reference frame in the frame of this pose."""
         position = np.zeros(3)
         quaternion = np.zeros(4)
         mujoco.mju_negPose(position, quaternion, *self)
         return Pose(position, quaternion)
 
     def raised(self, height: float) -> Pose:
-        """Return the pose moved by `height`, in m, along the world's z axis."""
+        """Return the pose moved by `height`, m, along the z axis of the world."""
         return Pose(self.position + np.array([0.0, 0.0, height]), self.quaternion)
 
     def is_near(self, other: Pose) -> bool:
-        """Return whether the two poses are equal up to rounding."""
+        """Return True if the two poses are equal up to rounding."""
         return (
             bool(np.all(np.abs(self.position - other.position) < MAX_DIFFERENCE))
             and self.angle_to(other) < MAX_DIFFERENCE
         )
 
     def angle_to(self, other: Pose) -> float:
-        """Return the angle between the two orientations, in rad."""
+        """Return the angle between the two orientations, rad."""
         return norm(self._turn_to(other))
 
     def towards(self, other: Pose, part: float) -> Pose:
-        """Return the pose at `part`, 0 to 1, of the straight way to `other`, turning at a constant
-        rate.
+        """Return the pose at `part`, 0 to 1, of a straight motion to `other`.
+
+        The pose turns at a constant rate.
         """
         quaternion = self.quaternion.copy()
         mujoco.mju_quatIntegrate(quaternion, self._turn_to(other), part)
         return Pose((1.0 - part) * self.position + part * other.position, quaternion)
 
     def _turn_to(self, other: Pose) -> Array:
+        """Return the rotation vector from this orientation to `other`, (3,), rad."""
         turn = np.zeros(3)
         mujoco.mju_subQuat(turn, other.quaternion, self.quaternion)
         return turn
@@ -81,25 +83,26 @@ def site_pose(data: mujoco.MjData, site: int) -> Pose:
 
 
 def turned_about_z(yaw: float) -> Array:
-    """Return the quaternion of a rotation by `yaw`, in rad, about z."""
+    """Return the quaternion of a rotation by `yaw`, rad, about z."""
     return np.array([math.cos(yaw / 2.0), 0.0, 0.0, math.sin(yaw / 2.0)])
 
 
 def yaw_of(quaternion: Array) -> float:
-    """Return the angle about the world's z axis, in rad, to which `quaternion` turns the x axis."""
+    """Return the angle about the world's z axis by which `quaternion` turns the x axis, rad."""
     turned = np.zeros(3)
     mujoco.mju_rotVecQuat(turned, np.array([1.0, 0.0, 0.0]), quaternion)
     return math.atan2(turned[1], turned[0])
 
 
 def pointing(direction: ArrayLike, yaw: float = 0.0) -> Array:
-    """Return the quaternion that turns z to `direction` (3,), turned by `yaw`, in rad, about it."""
+    """Return a quaternion that turns z to `direction`, (3,), and by `yaw`, rad, about it."""
     target = np.array(direction, dtype=float)
     target /= norm(target)
     axis = np.cross([0.0, 0.0, 1.0], target)
     sine = norm(axis)
     cosine = float(target[2])
-    # Straight down, any horizontal axis is possible: x keeps the tool's y across the yaw.
+    # For a direction straight down any horizontal axis is possible. With x, the y axis of the tool
+    # stays perpendicular to the direction of the yaw.
     axis = np.array([1.0, 0.0, 0.0]) if sine < MAX_PARALLEL_SINE else axis / sine
     turn = np.zeros(4)
     result = np.zeros(4)

@@ -1,5 +1,6 @@
-"""The primitive level: paths become jerk-limited joint set points, one per cycle, timed in the
-background.
+"""The primitive level: turns paths into one jerk-limited joint set point per cycle.
+
+Its planner times the paths in the background.
 """
 
 from rack.levels.primitive.executor import PrimitiveExecutor

@@ -1,5 +1,6 @@
-"""The executor of the primitive level: a joint set point every cycle, from paths that its planner
-has timed.
+"""The executor of the primitive level: writes a joint set point in every cycle.
+
+The set points follow paths that the planner has timed.
 """
 
 from __future__ import annotations
@@ -47,22 +48,21 @@ from rack.levels.primitive.tracking import (
     Tracking,
 )
 from rack.levels.robot.cell import cell_of
-from rack.levels.tables import read_params
 
 Work = PathWork | GripperWork
 
 DELAY_CYCLES = SEEN_CYCLES + LEAD_CYCLES - 1
-"""Cycles from the sensing of the world model to the set point commanded last: bodies keep moving in
-that time."""
+"""Cycles from the sensing of the world model to the set point commanded last. Bodies keep moving
+during this time."""
 
 
 class PrimitiveExecutor(Executor):
-    """Executes the segments of the window, oldest first, each from rest to rest, while the next one
-    is planned.
+    """Executes the segments of the window, oldest first, while the next one is planned.
 
-    The set point written at tick T is due `LEAD_CYCLES` later. After a restart the level restores
-    its state from its own last messages. It rests on its path while the board above is lost, and on
-    `hold` from above or from an operator; while the servo does not follow, it waits.
+    Every segment begins and ends at rest. The set point written at tick T is due `LEAD_CYCLES`
+    later. After a restart the level restores its state from its own last messages. It rests on its
+    path while the board above is lost, and on `hold` from above or from an operator. While the
+    servo level does not follow, it waits.
     """
 
     above = Input(MoveCommand, "above.command")
@@ -77,10 +77,11 @@ class PrimitiveExecutor(Executor):
     commands = HOLDABLE
     preloads = (collision, paths)
     params = PrimitiveParams
+    settings: PrimitiveParams
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        params = read_params(PrimitiveParams, context.params)
+        params = self.settings
         cell = cell_of(context)
         self._rules = WorkRules(context.robot.joints, cell.limits, params, context.period_s)
         self._guard = Guard(cell, context.scene, params.lookahead, DELAY_CYCLES * context.period_s)
@@ -99,18 +100,15 @@ class PrimitiveExecutor(Executor):
         self._memory = Memory()
         self._work: Work | None = None
         self._fault: SegmentFault | None = None
-        self._begun = 0  # serial of the last segment begun
-        self._position = cell.home.copy()  # (joints,), rad: the last one commanded
+        self._begun = 0  # serial of the last segment that was begun
+        self._position = cell.home.copy()  # (joints,), rad: last position commanded
         self._rest = JointSetPoint(self._position, *np.zeros((2, len(cell.home))))
-        self._tick: int | None = None  # of the last cycle
-        self._displaced = (
-            False  # the servo was out of step since the last path: the arm may not be at its end
-        )
+        self._tick: int | None = None  # tick of the last cycle
+        # The servo was out of step since the last path, so the arm may not be at its end.
+        self._displaced = False
 
     def process(self, tick: int) -> None:
-        """Read command, status, plan and world model; write the next set point and this level's
-        status.
-        """
+        """Do one cycle: read all inputs, advance the segment, write set point and status."""
         if self._tick is None:
             self._tick = tick - self.context.every
             self._memory = recall(self.last_status, self.last_command)
@@ -121,7 +119,7 @@ class PrimitiveExecutor(Executor):
         serials = window(self.above.message)
         self._plans.accept(self.plan, serials)
         if servo.error == Error.DISABLED:
-            # Plan from where the arm is: while it is not enabled, it may be moved by hand.
+            # While the arm is not enabled it may be moved by hand, so plan from where it is.
             self._displaced = True
             if not self._memory.is_known:
                 self._position[:] = servo.position
@@ -157,10 +155,17 @@ class PrimitiveExecutor(Executor):
             work.begin()
 
     def _carry(self, row: int, tick: int) -> None:
+        """Let the guard carry object `row`, or nothing if -1, once a scene shows it."""
         self._sight.carry(row, tick - SEEN_CYCLES * self.context.every)
 
     def _do_segments(self, serials: list[int], tick: int, passed_s: float) -> None:
-        """Do one cycle of the work: finish, drop, begin or advance it."""
+        """Do one cycle of the current segment: finish, withdraw, begin or advance it.
+
+        Args:
+            serials: Segments in the window of the level above.
+            tick: Tick of the cycle.
+            passed_s: Time since the last cycle.
+        """
         hold = self.above.message.hold or self.above.is_lost or self._orders.holds
         if self.below.is_new:
             self._finish(self.below.message, tick)
@@ -183,11 +188,12 @@ class PrimitiveExecutor(Executor):
             )
             plan = self._plans.trajectory(work.segment.id, work.motion.s)
             due_s = (tick + (LEAD_CYCLES - 1) * self.context.every) * self.context.tick_s
-            part = self._bring_up if self.below.message.slowed else 1.0
-            work.step(WorkCycle(hold, plan, self.world.message, due_s, passed_s, part))
+            speed_scale = self._bring_up if self.below.message.slowed else 1.0
+            work.step(WorkCycle(hold, plan, self.world.message, due_s, passed_s, speed_scale))
             self._position[:] = work.motion.set_point.position
 
     def _finish(self, servo: ServoStatus, tick: int) -> None:
+        """Finish the current segment if the servo shows that it is done."""
         work = self._work
         if work is None or self._fault is not None or not work.done(servo):
             return
@@ -198,8 +204,10 @@ class PrimitiveExecutor(Executor):
         self._work = None
 
     def _withdraw(self, serials: list[int]) -> bool:
-        """Drop work and fault that have left the window; return whether the work must first ramp to
-        rest.
+        """Drop a segment and a fault that have left the window.
+
+        Returns:
+            True if the segment must first ramp to rest.
         """
         serial = self._work.segment.id if self._work is not None else self._begun
         if serial in serials:
@@ -207,7 +215,7 @@ class PrimitiveExecutor(Executor):
         if isinstance(self._work, PathWork):
             if not self._work.motion.resting:
                 return True
-            # Messages may arrive out of order: a withdrawn segment may return, and then continues.
+            # Messages may arrive out of order, so a withdrawn segment may return and continue.
             self._memory.interrupted = serial
             self._memory.progress = self._work.progress
         self._work = None
@@ -215,7 +223,7 @@ class PrimitiveExecutor(Executor):
         return False
 
     def _begin(self, serials: list[int], hold: bool) -> None:
-        """Begin the oldest segment that is not done; with `hold`, the gripper waits."""
+        """Begin the oldest segment that is not done. With `hold`, a gripper segment waits."""
         memory = self._memory
         serial = next((s for s in serials if s > memory.done), 0)
         if not serial:
@@ -238,6 +246,7 @@ class PrimitiveExecutor(Executor):
         memory.interrupted = 0
 
     def _begin_path(self, segment: MotionSegment, memory: Memory) -> PathWork:
+        """Begin a path, from where the arm is if it may be off the start of the path."""
         path = segment.path()
         self._guard.watch(segment, path, self.below.message.opening, self.world.message)
         work = PathWork(segment, path, self._guard, self._rules)
@@ -251,8 +260,11 @@ class PrimitiveExecutor(Executor):
         return work
 
     def _wanted(self, serials: list[int]) -> tuple[int, float]:
-        """Return the segment for which a trajectory is wanted, and the path parameter of its start;
-        0: none.
+        """Find the segment that needs a trajectory next.
+
+        Returns:
+            Its serial, or 0 for none, and the path parameter at which the trajectory must begin,
+            rad.
         """
         work = self._work
         kinds = self.above.message.segments["kind"].tolist()
@@ -273,11 +285,12 @@ class PrimitiveExecutor(Executor):
         return tick + LEAD_CYCLES * self.context.every
 
     def _write_set_point(self, command: JointCommand, tick: int) -> None:
+        """Write the set point, or none (`due` is 0) while the servo is out of step."""
         work = self._work
         memory = self._memory
         in_step = self._tracking.in_step
         command.id = tick // self.context.every + 1 if memory.is_known else 0
-        # Out of step the arm's position is not certain: no set point is better than a wrong one.
+        # Out of step, the position of the arm is uncertain, and a set point might be wrong.
         command.due = self._due(tick) if in_step else 0
         set_point = work.motion.set_point if in_step and isinstance(work, PathWork) else self._rest
         command.position[:] = self._position
@@ -289,6 +302,7 @@ class PrimitiveExecutor(Executor):
             command.held = memory.held
 
     def _write_status(self, status: PrimitiveStatus, serials: list[int], tick: int) -> None:
+        """Write the status of this level."""
         memory = self._memory
         work = self._work
         status.echo = self.above.message.id
@@ -312,16 +326,14 @@ class PrimitiveExecutor(Executor):
         status.ends = 0.0
         if isinstance(work, PathWork):
             status.progress = work.progress
-            # Out of step, the world is not the reason why motion holds.
+            # Out of step, motion does not hold because of an obstacle.
             status.blocked = work.blocked and self._tracking.in_step
             status.resting = work.motion.resting
             status.ends = work.ends_s(self._due(tick) * self.context.tick_s)
         status.wants, status.begin = self._wanted(serials)
 
     def _reason_to_wait(self) -> str:
-        """Return the reason why the level waits, and the condition that ends the wait; empty: it
-        does not.
-        """
+        """Return why the level waits and what ends the wait, or an empty text if it does not."""
         work = self._work
         command = self.above
         if not self._tracking.in_step:
@@ -338,8 +350,7 @@ class PrimitiveExecutor(Executor):
             return ABOVE_LOST
         if command.message.hold:
             return HELD_FROM_ABOVE
-        unplanned = work is not None and work.unplanned_cycles > MAX_UNEXPLAINED_CYCLES
-        if work and unplanned:
+        if work is not None and work.unplanned_cycles > MAX_UNEXPLAINED_CYCLES:
             return f"segment {work.segment.id} waits for its trajectory from the planner"
         return ""
 
@@ -351,6 +362,7 @@ class PrimitiveExecutor(Executor):
         self._orders.report(self.status, above)
 
     def _state(self, serials: list[int]) -> State:
+        """Return the state to report, apart from HOLDING."""
         if self._fault is not None:
             return State.ERROR
         if self._work is not None or any(serial > self._memory.done for serial in serials):

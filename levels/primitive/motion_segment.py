@@ -1,4 +1,4 @@
-"""Segments of work from the window of the level above, and the executor's memory of them."""
+"""Segments in the window of the level above, and the state that survives a restart."""
 
 from __future__ import annotations
 
@@ -21,23 +21,28 @@ from rack.levels.motion.path import BlendedPath
 
 
 class SegmentFault(NamedTuple):
-    """The reason why a segment cannot be done."""
+    """Why a segment cannot be done."""
 
     code: Error
     reason: str
-    earliest: float = 0.0  # with TOO_LATE: the simulated time that could be met, s
+    earliest: float = 0.0  # for TOO_LATE: earliest possible simulated time, s
 
 
 class MotionSegment(MoveSegment):
     """A copy of one segment of a `MoveCommand`."""
 
     def path(self) -> BlendedPath:
-        """Return the segment's path. Raises `ValueError` for an invalid one."""
+        """Return the path of the segment.
+
+        Raises:
+            ValueError: The path is invalid.
+        """
         return BlendedPath(self.waypoints[: self.count], self.blend[: self.count])
 
     def too_late(self, earliest_s: float) -> SegmentFault:
         """Return the fault of a segment that cannot be done before `earliest_s`."""
-        earliest_s = ceil(earliest_s * 1e3) / 1e3  # rounded up: the time printed here can be met
+        # Rounded up, so that the printed time can be met.
+        earliest_s = ceil(earliest_s * 1e3) / 1e3
         reason = (
             f"segment {self.id} is wanted by {self.by:.3f} s; the earliest is {earliest_s:.3f} s"
         )
@@ -51,9 +56,10 @@ def window(command: MoveCommand) -> list[int]:
 
 
 def read_segment(command: MoveCommand, serial: int) -> MotionSegment:
-    """Return the segment with that serial, which must be in the window.
+    """Return a copy of a segment, which must be in the window.
 
-    Raises `ValueError` for an unknown kind and for numbers that are not finite.
+    Raises:
+        ValueError: Its kind is unknown, or a number is not finite.
     """
     record = command.segments[window(command).index(serial)]
     segment = MotionSegment(record.dtype)
@@ -67,21 +73,22 @@ def read_segment(command: MoveCommand, serial: int) -> MotionSegment:
 
 @dataclass
 class Memory:
-    """The state with which the executor continues after a restart of its board; its own last
-    messages hold it.
+    """The state with which the executor continues after a restart of its board.
+
+    It is read back from the executor's own last messages.
     """
 
-    is_known: bool = False  # True once this level, restarts included, was in step with the servo
-    done: int = 0  # newest segment done
-    interrupted: int = 0  # segment that was interrupted; 0: none
-    progress: float = 0.0  # part of its path done, 0 to 1
-    held: int = -1  # row of the object in the gripper; -1: none
-    opening: float = 0.0  # commanded to the gripper, m
-    force: float = 0.0  # commanded to the gripper, N
+    is_known: bool = False  # the level was in step with the servo, perhaps before a restart
+    done: int = 0  # serial of the newest segment done
+    interrupted: int = 0  # serial of the interrupted segment, or 0
+    progress: float = 0.0  # part of that segment's path done, 0 to 1
+    held: int = -1  # row of the object in the gripper, or -1
+    opening: float = 0.0  # commanded, m
+    force: float = 0.0  # commanded, N
 
 
 def recall(status: Reading[PrimitiveStatus], command: Reading[JointCommand]) -> Memory:
-    """Return the state in the level's own last messages; not `is_known` before the first ones."""
+    """Return the state in the level's last messages; it is not known before the first ones."""
     if not (status.is_there and command.is_there and command.message.id):
         return Memory()
     return Memory(

@@ -1,6 +1,4 @@
-"""The guard checks the remaining path in every cycle; sight checks that the world model is recent
-enough for motion.
-"""
+"""Checks the remaining path for collisions, and the age of the world model used for it."""
 
 from __future__ import annotations
 
@@ -18,31 +16,40 @@ from rack.levels.robot.cell import Cell
 from rack.levels.tables import SceneConfig
 
 NEAR_CHECKS = 9
-"""Configurations checked per cycle within the look-ahead."""
+"""Number of configurations checked per cycle within the look-ahead."""
 FAR_CHECKS = 3
-"""Configurations checked per cycle on the rest of the path."""
+"""Number of configurations checked per cycle on the rest of the path."""
 PHASES = 4
-"""Cycles over which the near checks step through the gaps between them."""
+"""Number of cycles in which the near checks cover the gaps between them."""
 FAR_STEP_RAD = 0.04
-"""Spacing of the configurations on the rest of the path."""
+"""Spacing of the configurations checked on the rest of the path."""
 CLEARANCE_PART = 0.5
-"""Part of the planned clearance that must be left: sensed poses are not exact."""
+"""Part of the planned clearance that must remain, because sensed poses are not exact."""
 MAX_REST_M_S = 0.01
-"""An obstacle slower than this, along every axis, is at rest."""
+"""An obstacle slower than this along every axis counts as at rest."""
 
 
 class Guard:
     """Watches one path at a time against the world model.
 
     In every cycle it checks the path over the next `lookahead_s`, with every obstacle extrapolated
-    by its velocity to the time at which the arm arrives, and a few configurations of the whole
-    remaining path against all bodies as they are. The latter count only while no obstacle moves: a
-    moving one may be gone by then. At most 13 checks per cycle.
+    by its velocity to the time at which the arm arrives. It also checks a few configurations of the
+    whole remaining path against all bodies where they are now. These count only while no obstacle
+    moves, because a moving one may be gone by the time the arm arrives. A cycle makes at most 13
+    checks.
+
+    Attributes:
+        obstacle: Last pair of geoms found too close, with its distance and the required one.
     """
 
     def __init__(self, cell: Cell, scene: SceneConfig, lookahead_s: float, delay_s: float) -> None:
-        """Look `lookahead_s` ahead; `delay_s` is the time from sensing the world to the set point
-        commanded last.
+        """Guard the paths of an arm.
+
+        Args:
+            cell: Model of the arm and its surroundings.
+            scene: Bodies and clearance.
+            lookahead_s: Time ahead of the arm that is checked in every cycle.
+            delay_s: Time from the sensing of the world to the set point commanded last.
         """
         self._checker = CollisionChecker(cell, scene)
         self._clearance = CLEARANCE_PART * scene.clearance
@@ -56,30 +63,41 @@ class Guard:
         self._obstructed: float | None = None
         self._least = self._clearance
         self._ahead = np.zeros((self._rows, 3))
-        self.obstacle = ""  # the last pair of geoms found too close, with distance and bound
+        self.obstacle = ""
 
     def carry(self, row: int, q: Array, world: WorldState) -> None:
-        """Carry object `row` with the tool, from its pose in `world` while the arm is at `q`
-        (joints,), rad.
+        """Carry an object with the tool from now on.
+
+        Args:
+            row: Row of the object in the world model.
+            q: Position of the arm, (joints,), rad.
+            world: World model that shows the object in the gripper.
         """
-        seen = Pose(world.position[row], world.quaternion[row])
-        self._checker.hold(row, *(self._checker.tool_at(q).inverse() @ seen))
+        object_pose = Pose(world.position[row], world.quaternion[row])
+        self._checker.hold(row, *(self._checker.tool_at(q).inverse() @ object_pose))
 
     def carry_nothing(self) -> None:
-        """Carry no object."""
+        """Carry no object with the tool from now on."""
         self._checker.hold(None)
 
     def watch(
         self, segment: MotionSegment, path: BlendedPath, opening: float, world: WorldState
     ) -> None:
-        """Begin to watch the path of a segment, with the gripper at `opening`, in m."""
+        """Begin to watch the path of a segment.
+
+        Args:
+            segment: Segment, which says what it may touch.
+            path: Its path.
+            opening: Opening of the gripper, m or rad.
+            world: Newest world model.
+        """
         self._checker.open_gripper(opening)
         row = segment.object if segment.object >= 0 else None
-        self._checker.permit(row, segment.touch and row is not None)
+        self._checker.permit(row, segment.touch)
         self._checker.place(world.position, world.quaternion)
-        # Motion may start too close to something, but must not get closer.
-        room = self._checker.room(path.evaluate(0.0).q)
-        self._least = min(self._clearance, max(room, 0.0) * CLEARANCE_PART)
+        # Motion may start close to something, but must not get much closer.
+        start_clearance = self._checker.room(path.evaluate(0.0).q)
+        self._least = min(self._clearance, max(start_clearance, 0.0) * CLEARANCE_PART)
         self._obstructed = None
         self._cursor = 0.0
         self.obstacle = ""
@@ -87,8 +105,16 @@ class Guard:
     def is_clear(
         self, path: BlendedPath, trajectory: Trajectory, time_s: float, world: WorldState
     ) -> bool:
-        """Return, by this cycle's share of the checks, whether the path is clear from `time_s`
-        on.
+        """Do the checks of one cycle.
+
+        Args:
+            path: Watched path.
+            trajectory: Trajectory along it.
+            time_s: Present time on the trajectory; only what follows is checked.
+            world: Newest world model.
+
+        Returns:
+            True if no checked configuration is blocked.
         """
         begin = trajectory.at(time_s).s
         obstacles = world.velocity[self._objects : self._rows]
@@ -102,8 +128,13 @@ class Guard:
     def _near_is_clear(
         self, path: BlendedPath, trajectory: Trajectory, time_s: float, moving: WorldState | None
     ) -> bool:
-        """Check the path within the look-ahead; `moving` is the world model while an obstacle
-        moves.
+        """Check the path within the look-ahead.
+
+        Args:
+            path: Watched path.
+            trajectory: Trajectory along it.
+            time_s: Present time on the trajectory.
+            moving: World model if an obstacle moves, else None.
         """
         self._phase = (self._phase + 1) % PHASES
         for k in range(NEAR_CHECKS):
@@ -120,7 +151,7 @@ class Guard:
         return True
 
     def _far_is_clear(self, path: BlendedPath, begin: float) -> bool:
-        """Check the last configuration found obstructed, then the next few."""
+        """Check the configuration that was blocked last, then the next few after `begin`, rad."""
         if self._obstructed is not None and self._obstructed >= begin:
             if not self._free(path, self._obstructed):
                 return False
@@ -135,6 +166,7 @@ class Guard:
         return True
 
     def _free(self, path: BlendedPath, s: float) -> bool:
+        """Return True if the arm is free at path parameter `s`; otherwise set `obstacle`."""
         if self._checker.free(path.evaluate(s).q, self._least):
             return True
         self.obstacle = self._checker.nearest()
@@ -142,16 +174,19 @@ class Guard:
 
 
 class Sight:
-    """Holds motion while the world model is stale, and gives the guard the pose of an object in the
-    gripper.
+    """Checks that the world model is fresh, and tells the guard the pose of a held object.
 
-    The model may be stale because its board is lost, or because it receives no scene: what counts
-    is the time at which the scene was sensed.
+    The model may be stale because its board is lost or because it receives no scene, so the time at
+    which the scene was sensed decides.
     """
 
     def __init__(self, guard: Guard, blind_ticks: int, has_bodies: bool) -> None:
-        """Treat a scene older than `blind_ticks` as unseen; without bodies there is nothing to
-        see.
+        """Watch the world model.
+
+        Args:
+            guard: Guard to tell about a held object.
+            blind_ticks: Age from which a scene is stale.
+            has_bodies: False for a scene without bodies, which never is stale.
         """
         self._guard = guard
         self._blind_ticks = blind_ticks
@@ -160,25 +195,32 @@ class Sight:
         self._waiting: tuple[int, int] | None = None
 
     def carry(self, row: int, since: int) -> None:
-        """Carry object `row` from its pose in a scene sensed at tick `since` or later; -1: carry
-        nothing.
+        """Carry object `row` from its pose in the first scene sensed at tick `since` or later.
+
+        A row of -1 carries nothing.
         """
         self._waiting = (row, since) if row >= 0 else None
         if row < 0:
             self._guard.carry_nothing()
 
     def update(self, world: Reading[WorldState], q: Array, tick: int) -> None:
-        """Process the newest world model; `q` (joints,), rad, is where the arm rests."""
+        """Process the newest world model, with the arm at rest at `q`, (joints,), rad.
+
+        Args:
+            world: Newest world model and its verdict.
+            q: Position of the arm.
+            tick: Tick of the cycle.
+        """
         model = world.message
-        seen = world.is_there and model.revision > 0
-        self._blind = self._has_bodies and (not seen or tick - model.sensed > self._blind_ticks)
-        if self._waiting is not None and seen and model.sensed >= self._waiting[1]:
+        is_seen = world.is_there and model.revision > 0
+        self._blind = self._has_bodies and (not is_seen or tick - model.sensed > self._blind_ticks)
+        if self._waiting is not None and is_seen and model.sensed >= self._waiting[1]:
             self._guard.carry(self._waiting[0], q, model)
             self._waiting = None
 
     @property
     def lacks(self) -> str:
-        """The reason why motion must wait for a new scene; empty: it need not."""
+        """Why motion must wait for a new scene. Empty if it need not."""
         if self._blind:
             return "world model is stale: waiting for a new scene"
         return "waiting for a scene that shows the held object" if self._waiting is not None else ""

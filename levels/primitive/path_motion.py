@@ -1,5 +1,6 @@
-"""Motion of the set point along one path: begun, held, resumed, ended; always at rest or on a
-trajectory.
+"""Motion of the set point along one path.
+
+The set point is always either at rest or on a trajectory. Motion can be held and resumed.
 """
 
 from __future__ import annotations
@@ -14,11 +15,11 @@ from rack.levels.motion.trajectory import Trajectory, make_stop
 from rack.levels.robot.limits import Limits
 
 NEAREST_STEP_RAD = 0.01
-"""Spacing of the points among which the one nearest to the arm is searched."""
+"""Spacing of the points among which the one nearest to the arm is chosen."""
 
 
 class JointSetPoint(NamedTuple):
-    """The set point of all joints at one time."""
+    """Set point of all joints at one time."""
 
     position: Array  # (joints,), rad
     velocity: Array  # (joints,), rad/s
@@ -28,34 +29,38 @@ class JointSetPoint(NamedTuple):
 class PathMotion:
     """The motion along one path.
 
-    The arm may begin slightly off the path: the motion removes the offset over its first
+    The arm may begin slightly off the path. The motion removes this offset during its first
     `bridging_s`.
+
+    Attributes:
+        path: The path.
+        s: Path parameter of the set point, rad.
+        trajectory: Trajectory along the path, or None at rest.
+        time_s: Time since the trajectory began.
+        stopping: The trajectory is a ramp to rest.
+        set_point: Set point computed by the last `advance_by`.
     """
 
     def __init__(self, path: BlendedPath, braking: Limits, bridging_s: float) -> None:
         self.path = path
-        self.s = 0.0  # path parameter of the set point, rad
-        self.trajectory: Trajectory | None = None  # None: at rest
-        self.time_s = 0.0  # since the trajectory began
-        self.stopping = False  # the trajectory is a ramp to rest
+        self.s = 0.0
+        self.trajectory: Trajectory | None = None
+        self.time_s = 0.0
+        self.stopping = False
         self._braking = braking
         self._bridging_s = bridging_s
-        self._offset = np.zeros(path.joints)
         self._bridged_s = bridging_s
-        # Commanded by the last `advance`.
-        self.set_point = JointSetPoint(
-            path.evaluate(0.0).q.copy(), np.zeros(path.joints), np.zeros(path.joints)
-        )
-        self._scratch = np.zeros(path.joints)
+        self._offset, self._scratch, *moving = np.zeros((4, path.joints))
+        self.set_point = JointSetPoint(path.evaluate(0.0).q.copy(), *moving)
 
     @property
     def resting(self) -> bool:
-        """True when the set point does not move."""
+        """True if the set point does not move."""
         return self.trajectory is None
 
     @property
     def finished(self) -> bool:
-        """True when the set point rests at the end of the path."""
+        """True if the set point rests at the end of the path."""
         return self.resting and self.s >= self.path.length and self._bridged_s >= self._bridging_s
 
     @property
@@ -64,40 +69,49 @@ class PathMotion:
         return self.trajectory.duration - self.time_s if self.trajectory is not None else 0.0
 
     def rest_at(self, position: Array) -> float:
-        """Rest at the start of the path, at `position` (joints,); return the largest joint distance
-        between them.
+        """Rest at the start of the path, with the arm at `position`, (joints,), rad.
+
+        Returns:
+            Largest distance of a joint from the path.
         """
         return self._rest(0.0, position)
 
     def rest_near(self, position: Array, progress: float) -> float:
-        """Rest at `position` (joints,), near the closest point of the path; return their largest
-        joint distance.
+        """Rest at the point of the path that is nearest to the arm.
 
-        Of points equally close, as on a path that returns to itself, the one nearest to `progress`,
-        0 to 1, counts.
+        A path may return to itself. Of equally near points, the one closest to `progress` is taken.
+
+        Args:
+            position: Position of the arm, (joints,), rad.
+            progress: Approximate part of the path that is done, 0 to 1.
+
+        Returns:
+            Largest distance of a joint from the path.
         """
         points = self.path.sample(NEAREST_STEP_RAD)
-        away = np.linalg.norm(points - position, axis=1)
-        before = np.append(np.inf, away[:-1])
-        after = np.append(away[1:], np.inf)
-        near = np.flatnonzero(
-            (away <= before) & (away <= after) & (away <= away.min() + NEAREST_STEP_RAD)
+        distances = np.linalg.norm(points - position, axis=1)
+        before = np.append(np.inf, distances[:-1])
+        after = np.append(distances[1:], np.inf)
+        minima = np.flatnonzero(
+            (distances <= before)
+            & (distances <= after)
+            & (distances <= distances.min() + NEAREST_STEP_RAD)
         )
-        # `linspace` ends exactly: rounding must not lead beyond the end, where no trajectory
-        # begins.
-        places = np.linspace(0.0, self.path.length, len(points))[near]
+        # `linspace` ends exactly: with rounding beyond the end, no trajectory could begin.
+        places = np.linspace(0.0, self.path.length, len(points))[minima]
         nearest = np.argmin(np.abs(places - progress * self.path.length))
         return self._rest(float(places[nearest]), position)
 
     def follow(self, trajectory: Trajectory) -> None:
-        """Start along `trajectory`, which begins at rest where the motion rests."""
+        """Start along a trajectory that begins at rest where the motion rests."""
         self.trajectory = trajectory
         self.time_s = 0.0
         self.stopping = False
 
     def hold(self) -> None:
-        """Begin to ramp to rest on the path as soon as the braking limits permit; call in every
-        cycle.
+        """Begin a ramp to rest on the path as soon as the braking limits permit it.
+
+        Call this in every cycle while motion must hold.
         """
         if self.trajectory is None or self.stopping:
             return
@@ -122,20 +136,20 @@ class PathMotion:
         np.multiply(d2q_ds2, ds * ds, out=acceleration)
         acceleration += np.multiply(dq_ds, dds, out=self._scratch)
         if self._bridged_s < self._bridging_s:
-            # Add the remaining distance to the path: a quintic from one to zero, at rest at
-            # both ends.
+            # Add the remaining offset: a quintic from one to zero, at rest at both ends.
             self._bridged_s = min(self._bridged_s + duration_s, self._bridging_s)
             u = self._bridged_s / self._bridging_s
             per_s = 1.0 / self._bridging_s
-            left = 1.0 - u**3 * (10.0 + u * (6.0 * u - 15.0))
+            remaining_part = 1.0 - u**3 * (10.0 + u * (6.0 * u - 15.0))
             rate = -30.0 * u**2 * (1.0 - u) ** 2 * per_s
             change = -60.0 * u * (1.0 - u) * (1.0 - 2.0 * u) * per_s**2
-            for value, factor in zip(self.set_point, (left, rate, change), strict=True):
+            for value, factor in zip(self.set_point, (remaining_part, rate, change), strict=True):
                 value += np.multiply(self._offset, factor, out=self._scratch)
         if self.time_s >= self.trajectory.duration:
             self._come_to_rest()
 
     def _rest(self, s: float, position: Array) -> float:
+        """Rest at path parameter `s` with the arm at `position`; return their largest distance."""
         self.s = s
         self._stand()
         np.subtract(position, self.path.evaluate(s).q, out=self._offset)
@@ -145,9 +159,10 @@ class PathMotion:
         return distance
 
     def _come_to_rest(self) -> None:
+        """End the trajectory, once the offset from the path is removed."""
         if self._bridged_s < self._bridging_s:
             return
-        # Trajectories end with rounding errors; set the exact end of the path.
+        # Trajectories end with rounding errors, so set the exact end of the path.
         if not self.stopping or self.s > self.path.length - COINCIDENT_RAD:
             self.s = self.path.length
             self.set_point.position[:] = self.path.evaluate(self.s).q

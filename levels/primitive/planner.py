@@ -1,6 +1,4 @@
-"""The planner of the primitive level: times the next path, in the background, while the executor
-moves.
-"""
+"""The planner of the primitive level: times the next path while the executor moves."""
 
 from __future__ import annotations
 
@@ -15,39 +13,39 @@ from rack.levels.motion.trajectory import Trajectory, make_trajectory
 from rack.levels.primitive.motion_segment import MotionSegment, SegmentFault, read_segment, window
 from rack.levels.primitive.segment_work import PrimitiveParams, WorkRules
 from rack.levels.robot.cell import cell_of
-from rack.levels.tables import read_params
 
 
 class PrimitivePlanner(Planner):
-    """Makes the trajectory that the executor's status requests: of the next segment, or from where
-    a path was held.
+    """Computes the trajectory that the status of the executor requests.
+
+    It is for the next segment, or for the rest of a path that was held.
     """
 
     above = Input(MoveCommand, "above.command")
     status = Input(PrimitiveStatus, "own.status")
     output = Output(TrajectoryPlan)
     params = PrimitiveParams
+    settings: PrimitiveParams
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         limits = cell_of(context).limits
         self._positions = limits.position
-        params = read_params(PrimitiveParams, context.params)
-        self._rules = WorkRules(context.robot.joints, limits, params, context.period_s)
+        self._rules = WorkRules(context.robot.joints, limits, self.settings, context.period_s)
         self._made = (0, 0.0)
         self._answered_at = 0
 
     def wanted(self, tick: int) -> bool:
-        """Return whether the executor wants a trajectory that it has not received."""
+        """Return True if the executor wants a trajectory that it has not received."""
         status = self.status.message
         if status.wants not in window(self.above.message):
             return False
-        # The status shows a plan one cycle later. If it is still wanted after that, it was lost
-        # with the board.
+        # The status reflects a plan one cycle later. If the plan is still wanted after that, it was
+        # lost with the board.
         return (status.wants, status.begin) != self._made or tick > self._answered_at
 
     def plan(self, tick: int) -> None:
-        """Time the wanted segment from its point of departure, or give the reason why not."""
+        """Time the wanted segment from where it is to begin, or give the reason why not."""
         plan = self.output
         status = self.status.message
         context = self.context
@@ -78,8 +76,10 @@ class PrimitivePlanner(Planner):
         plan.error, plan.reason, plan.earliest = fault or (Error.NONE, "", plan.earliest)
 
     def _path(self, segment: MotionSegment) -> BlendedPath:
-        """Return the segment's path. Raises `ValueError` for one that is invalid or leaves a
-        joint's range.
+        """Return the path of a segment.
+
+        Raises:
+            ValueError: The path is invalid or leaves the range of a joint.
         """
         path = segment.path()
         low, high = self._positions.T
@@ -95,15 +95,13 @@ class PrimitivePlanner(Planner):
 
 
 class Plans:
-    """The executor's copies of plans: the newest trajectory, or refusal, of every segment in the
-    window.
-    """
+    """The executor's copies of plans: the newest trajectory or refusal of every open segment."""
 
     def __init__(self) -> None:
         self._plans: dict[int, Trajectory | SegmentFault] = {}
 
     def accept(self, plan: Reading[TrajectoryPlan], window: Collection[int]) -> None:
-        """Copy a new plan; drop those of segments that have left the window."""
+        """Copy a new plan, and drop plans of segments that have left the window."""
         for serial in [s for s in self._plans if s not in window]:
             del self._plans[serial]
         message = plan.message
@@ -120,17 +118,15 @@ class Plans:
             )
 
     def trajectory(self, serial: int, begin: float) -> Trajectory | None:
-        """Return the trajectory of a segment from path parameter `begin`; None: none yet."""
+        """Return the trajectory of a segment that starts at path parameter `begin`, or None."""
         plan = self._plans.get(serial)
         return plan if isinstance(plan, Trajectory) and plan.begin == begin else None
 
     def lacks(self, serial: int, begin: float) -> bool:
-        """Return whether there is neither a trajectory from `begin` nor a refusal of the
-        segment.
-        """
+        """Return True if a segment has neither a trajectory from `begin` nor a refusal."""
         return self.trajectory(serial, begin) is None and self.refusal(serial) is None
 
     def refusal(self, serial: int) -> SegmentFault | None:
-        """Return why the planner refuses a segment; None: it does not."""
+        """Return why the planner refuses a segment, or None if it does not."""
         plan = self._plans.get(serial)
         return plan if isinstance(plan, SegmentFault) else None

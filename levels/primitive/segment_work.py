@@ -1,7 +1,7 @@
 """Execution of segments.
 
 A path starts when it is planned and clear, holds on command or for the guard, and is done when the
-arm has settled. A gripper segment is done when the gripper rests.
+arm has settled. A gripper segment is done when the gripper is at rest.
 """
 
 from __future__ import annotations
@@ -24,27 +24,26 @@ from rack.levels.robot.limits import Limits
 from rack.levels.tables import GripperConfig, Positive, Table
 
 ANSWER_CYCLES = 3
-"""Cycles from the end of a trajectory until its segment is reported done, in addition to those of
-settling.
+"""Cycles from the end of a trajectory until its segment is reported done, in addition to settling.
 
-In these the last set point becomes due, the servo's status shows it, and this level's status
-becomes visible."""
+During these the last set point becomes due, the status of the servo shows it, and the status of
+this level becomes visible."""
 
 
 class PrimitiveParams(Table):
-    """Bounds of following, settling and guarding, in `[board.<name>.params]`."""
+    """`[board.<name>.params]`: bounds of following, settling and guarding."""
 
     following: Positive = 0.05
-    """largest distance of a joint from its set point under way, rad"""
+    """largest distance of a joint from its set point during motion, rad"""
     straying: Positive = 0.1
     """time that a joint may be farther than that before it is an error, s"""
     settled: Positive = 0.003
     """largest distance of a settled joint from its goal, rad"""
     settled_opening: Positive | None = None
-    """largest speed of a settled gripper, m/s or rad/s; default: a twentieth of its way in a
+    """largest speed of a settled gripper, m/s or rad/s; default: a twentieth of its travel in a
     second"""
     settled_cycles: int = Field(3, ge=1, le=100)
-    """consecutive cycles that a settled arm stays so"""
+    """consecutive cycles within these bounds after which an arm counts as settled"""
     settling: Positive = 3.0
     """longest time that arm or gripper may take to settle, s"""
     astray: Positive = 0.02
@@ -52,15 +51,15 @@ class PrimitiveParams(Table):
     bridging: Positive = 0.5
     """time in which such a distance is removed, s"""
     silent: Positive = 10.0
-    """time without status from below, restarts included, that is an error, s"""
+    """time without status from below, restarts included, after which it is an error, s"""
     blind: Positive = 0.2
     """time without a new scene in the world model after which motion holds, s"""
     braking: float = Field(1.5, ge=1.0, le=3.0)
     """multiple of the planned acceleration and jerk limits that a hold may use"""
     lookahead: Positive = 2.0
-    """time ahead of the arm that the guard watches in every cycle, s"""
+    """time ahead of the arm that the guard checks in every cycle, s"""
     clear: Positive = 0.5
-    """time that the way must be clear before held motion continues, s"""
+    """time for which the path must be clear before held motion continues, s"""
 
 
 @dataclass(frozen=True)
@@ -74,7 +73,7 @@ class WorkRules:
 
     @property
     def braking(self) -> Limits:
-        """Limits of a hold: planned motion on a curve may use all of its own."""
+        """Limits of a hold. They exceed the planned ones, which motion on a curve may use up."""
         planned = self.limits
         factor = self.params.braking
         return replace(
@@ -82,18 +81,19 @@ class WorkRules:
         )
 
     def cycles(self, time_s: float) -> int:
-        """Return the cycles that fill `time_s`."""
+        """Return the number of cycles that fill `time_s`, at least 1."""
         return max(1, round(time_s / self.period_s))
 
     @property
     def latency_s(self) -> float:
-        """Time from the end of a trajectory until its segment is reported done, in s."""
+        """Time from the end of a trajectory until its segment is reported done, s."""
         return (self.params.settled_cycles + ANSWER_CYCLES) * self.period_s
 
 
 class Quiet:
-    """Counts cycles: enough consecutive quiet ones mean settled; too many in total mean that it
-    will never settle.
+    """Counts cycles to decide whether something has settled or takes too long.
+
+    Enough consecutive quiet cycles mean that it has settled.
     """
 
     def __init__(self, rules: WorkRules) -> None:
@@ -103,14 +103,14 @@ class Quiet:
         self._cycles = 0
 
     def settled(self, quiet: bool) -> bool:
-        """Count one cycle; return whether it has settled."""
+        """Count one cycle. Return True if it has settled."""
         self._cycles += 1
         self._quiet = self._quiet + 1 if quiet else 0
         return self._quiet >= self._wanted_cycles
 
     @property
     def overdue(self) -> bool:
-        """True when it should have settled long ago."""
+        """True if it should have settled by now."""
         return self._cycles > self._most_cycles
 
 
@@ -118,26 +118,36 @@ class WorkCycle(NamedTuple):
     """The inputs of one cycle of a path."""
 
     hold: bool
-    plan: Trajectory | None  # from where the motion rests
+    plan: Trajectory | None  # begins where the motion rests
     world: WorldState
     due_s: float  # simulated time of the set point commanded last
-    passed_s: float  # since the cycle before
-    part: float = 1.0  # of full speed, for a trajectory that begins
+    passed_s: float  # time since the cycle before
+    part: float = 1.0  # part of full speed for a trajectory that begins
 
 
 class PathWork:
-    """One PATH segment."""
+    """Execution of one PATH segment.
+
+    Attributes:
+        segment: The segment.
+        motion: Motion of the set point along its path.
+        fault: Why the segment cannot be done, or None.
+        blocked: An obstacle is in the way, or the arm is off the path.
+        astray: The arm is off the path.
+        obstacle: What blocked the motion last.
+        unplanned_cycles: Consecutive cycles in which the motion waits for a trajectory.
+    """
 
     def __init__(
         self, segment: MotionSegment, path: BlendedPath, guard: Guard, rules: WorkRules
     ) -> None:
         self.segment = segment
         self.motion = PathMotion(path, rules.braking, rules.params.bridging)
-        self.fault: SegmentFault | None = None  # why it cannot be done
-        self.blocked = False  # something is in the way
-        self.astray = False  # the arm is off the path
-        self.obstacle = ""  # what was in the way when the motion was blocked last
-        self.unplanned_cycles = 0  # consecutive cycles in which the motion waits for a trajectory
+        self.fault: SegmentFault | None = None
+        self.blocked = False
+        self.astray = False
+        self.obstacle = ""
+        self.unplanned_cycles = 0
         self._guard = guard
         self._rules = rules
         self._quiet = Quiet(rules)
@@ -145,7 +155,7 @@ class PathWork:
         self._fresh = True
 
     def begin_at(self, position: Array) -> None:
-        """Prepare to start from `position` (joints,), rad, where the path must begin."""
+        """Prepare to start from `position`, (joints,), rad, where the path must begin."""
         permitted = self._rules.params.astray
         distance = self.motion.rest_at(position)
         if distance > permitted:
@@ -153,19 +163,21 @@ class PathWork:
             self.fault = SegmentFault(Error.LIMIT, f"{begins}; valid: at most {permitted} rad")
 
     def begin_near(self, position: Array, progress: float) -> None:
-        """Prepare to continue from `position` (joints,), rad; blocked if that is off the path.
+        """Prepare to continue from `position`, (joints,), rad. Blocked if that is off the path.
 
-        `progress`, 0 to 1, is about the part of the path that is done.
+        Args:
+            position: Position of the arm.
+            progress: Approximate part of the path that is done, 0 to 1.
         """
         self._fresh = False
         self._clear_cycles = 0
         self._quiet = Quiet(self._rules)
-        away = self.motion.rest_near(position, progress)
-        self.astray = self.blocked = away > self._rules.params.astray
-        self.obstacle = f"the arm is {away:.3f} rad off its path"
+        distance = self.motion.rest_near(position, progress)
+        self.astray = self.blocked = distance > self._rules.params.astray
+        self.obstacle = f"the arm is {distance:.3f} rad off its path"
 
     def step(self, cycle: WorkCycle) -> None:
-        """Advance by one cycle."""
+        """Do one cycle: check the path, start or hold the motion, and advance it."""
         motion = self.motion
         waits = self.begin_wanted is not None
         if motion.trajectory is not None and not motion.stopping:
@@ -180,17 +192,20 @@ class PathWork:
         motion.advance(cycle.passed_s)
 
     def done(self, status: DrivenArm) -> bool:
-        """Return whether set point and arm rest at the end of the path."""
+        """Return True if the set point and the arm rest at the end of the path.
+
+        Call this once for each new status. It sets `fault` if the arm does not settle in time.
+        """
         if not self.motion.finished:
             return False
-        away = np.abs(status.position - self.motion.set_point.position)
-        settled = self._quiet.settled(bool((away < self._rules.params.settled).all()))
+        distances = np.abs(status.position - self.motion.set_point.position)
+        settled = self._quiet.settled(bool((distances < self._rules.params.settled).all()))
         if self._quiet.overdue and not settled:
-            joint = int(away.argmax())
+            joint = int(distances.argmax())
             permitted = self._rules.params.settled
             name = self._rules.joints[joint]
             reason = (
-                f"joint '{name}' rests {away[joint]:.4f} rad from its goal; valid: at most"
+                f"joint '{name}' rests {distances[joint]:.4f} rad from its goal; valid: at most"
                 f" {permitted} rad"
             )
             self.fault = SegmentFault(Error.FOLLOWING, reason)
@@ -198,25 +213,27 @@ class PathWork:
 
     @property
     def begin_wanted(self) -> float | None:
-        """Where on the path a trajectory is to begin, in rad; None when the motion needs none."""
+        """Path parameter at which a trajectory must begin, rad. None if the motion needs none."""
         motion = self.motion
         return motion.s if motion.resting and not motion.finished and not self.astray else None
 
     @property
     def progress(self) -> float:
-        """Part of the path done, 0 to 1."""
+        """Part of the path that is done, 0 to 1."""
         length = self.motion.path.length
         return self.motion.s / length if length > 0.0 else 1.0
 
     def ends_s(self, due_s: float) -> float:
-        """Return the simulated time at which the segment should be done if the set point is due at
-        `due_s`, or 0.
+        """Return the simulated time at which the segment should be done, or 0 if it is not known.
+
+        The set point commanded last is due at `due_s`.
         """
         if self.motion.stopping or (self.motion.resting and not self.motion.finished):
             return 0.0
         return due_s + self.motion.remaining_s + self._rules.latency_s
 
     def _start(self, cycle: WorkCycle, plan: Trajectory) -> None:
+        """Start the trajectory if the path has been clear for long enough."""
         if cycle.part < 1.0:
             plan = plan.stretched(1.0 / cycle.part)
         clear = self._guard.is_clear(self.motion.path, plan, 0.0, cycle.world)
@@ -232,13 +249,16 @@ class PathWork:
             self._clear_cycles = 0
 
     def _block(self, blocked: bool) -> None:
+        """Set `blocked`, and keep the obstacle that blocked the motion first."""
         if blocked and not self.blocked:
             self.obstacle = self._guard.obstacle
         self.blocked = blocked
 
     def _timed(self, trajectory: Trajectory, due_s: float) -> Trajectory | None:
-        """Stretch the trajectory to end just in time; before the start, refuse one that is too
-        late.
+        """Stretch a trajectory so that it ends just in time.
+
+        Returns:
+            The trajectory, or None if it would end too late and the path has not been started.
         """
         if not self.segment.by or not trajectory.duration:
             return trajectory
@@ -250,34 +270,39 @@ class PathWork:
 
 
 class GripperWork:
-    """One GRIPPER segment: the gripper moves as far as its force permits; done when it rests."""
+    """Execution of one GRIPPER segment.
+
+    The gripper moves as far as its force permits, and the segment is done when it is at rest.
+    """
 
     def __init__(self, segment: MotionSegment, gripper: GripperConfig, rules: WorkRules) -> None:
         self.segment = segment
         self._gripper = gripper
         self._closes = abs(segment.opening - gripper.closed) < abs(segment.opening - gripper.open)
-        self.fault: SegmentFault | None = None  # why it cannot be done
+        self.fault: SegmentFault | None = None  # why the segment cannot be done
         self._rules = rules
         self.begin()
 
     def begin(self) -> None:
-        """Start waiting until the gripper rests: at the start, and when the servo is back in
-        step.
-        """
+        """Wait for the gripper to rest: at the start, and when the servo is back in step."""
         self._cycles = 0
         self._quiet = Quiet(self._rules)
 
     @property
     def held_after(self) -> int:
-        """The object in the gripper afterwards: the segment's, if the gripper ends nearer to closed
-        than to open; -1: none.
+        """Row of the object in the gripper after the segment, or -1.
+
+        It is the object of the segment if the gripper ends nearer to closed than to open.
         """
         return self.segment.object if self._closes else -1
 
     def done(self, status: DrivenArm) -> bool:
-        """Return whether the gripper rests."""
+        """Return True if the gripper rests.
+
+        Call this once for each new status. It sets `fault` if the gripper does not rest in time.
+        """
         self._cycles += 1
-        # Before the command reaches it, the gripper rests too.
+        # The gripper also rests until the command reaches it.
         if self._cycles <= HANDOVER_CYCLES:
             return False
         speed = abs(status.opening_velocity)

@@ -1,4 +1,4 @@
-"""Whether the servo receives and follows set points: motion continues only while it does."""
+"""Checks that the servo receives and follows set points; motion continues only while it does."""
 
 from __future__ import annotations
 
@@ -12,38 +12,42 @@ from rack.levels.messages import DrivenArm, Error
 from rack.levels.primitive.motion_segment import SegmentFault
 
 LEAD_CYCLES = 2
-"""Cycles from the release that makes a set point to the tick at which it is due.
+"""Cycles from the release that computes a set point to the tick at which it is due.
 
-One cycle of logical execution time brings it to the servo, which then interpolates to it over a
-second one."""
+The set point becomes visible to the servo after one cycle. The servo then interpolates to it over a
+second cycle."""
 SEEN_CYCLES = 2
-"""Cycles by which the world model lags the servo."""
+"""Cycles by which the world model lags behind the servo."""
 HANDOVER_CYCLES = 4
-"""Cycles from the first set point until the servo's status must show that it follows."""
+"""Cycles from the first set point until the status of the servo must show that it follows."""
 MAX_MISSED_STATUSES = 3
-"""Consecutive cycles without a new status after which the servo is silent."""
+"""Consecutive cycles without a new status after which the servo counts as silent."""
 MAX_REST_RAD_S = 1e-3
-"""A joint whose interpolated set point is slower than this rests."""
+"""A joint whose interpolated set point is slower than this counts as at rest."""
 MAX_UNEXPLAINED_CYCLES = 50
-"""A longer wait is reported with its reason; shorter ones are normal after a restart."""
+"""Cycles after which a wait is reported with its reason. Short ones are normal after a restart."""
 
 
 class Tracking:
-    """Decides from the servo's status whether it is in step with this level.
+    """Decides from the status of the servo whether it is in step with this level.
 
-    They fall out of step when either restarts, or misses so many cycles that the servo holds by
-    itself. They get back into step when the servo holds the arm at rest and is not stopped; motion
-    continues from there.
+    The two fall out of step when either restarts, or misses enough cycles for the servo to hold by
+    itself. They get back into step when the servo holds the arm at rest and is not stopped. Motion
+    then continues from the place where it is held.
+
+    Attributes:
+        in_step: The servo follows set points.
+        silent_cycles: Consecutive cycles without a new status.
     """
 
     def __init__(self) -> None:
         self.in_step = False
-        self.silent_cycles = 0  # consecutive cycles without a new status
+        self.silent_cycles = 0
         self._cycles_in_step = 0
         self._unexplained_cycles = 0
 
     def update(self, status: Reading[DrivenArm]) -> bool:
-        """Process one status; True in the cycle in which servo and level get into step."""
+        """Process one status. Return True in the cycle in which the two get into step."""
         heard = status.is_new and not status.is_lost
         self.silent_cycles = 0 if heard else self.silent_cycles + 1
         self._cycles_in_step += 1
@@ -67,7 +71,7 @@ class Tracking:
         return True
 
     def awaited(self, servo: DrivenArm) -> str:
-        """Return what a level out of step waits for."""
+        """Describe what a level that is out of step waits for."""
         if self.silent_cycles > MAX_MISSED_STATUSES:
             return f"waiting for servo: no status for {self.silent_cycles} cycles"
         if servo.state == State.HOLDING and servo.reason:
@@ -82,16 +86,28 @@ class Tracking:
 
 
 class Straying:
-    """Counts cycles in which the arm is off its set point: a few are permitted, and motion holds
-    meanwhile.
+    """Counts cycles in which a joint is too far from its set point.
+
+    A few such cycles are permitted; motion holds during them.
+
+    Attributes:
+        place: The joint and its distance, or empty if none is too far away.
+        fault: Set when it lasts too long.
     """
 
     def __init__(self, joints: Sequence[str], permitted_rad: float, permitted_cycles: int) -> None:
+        """Permit `permitted_rad` always, and more for `permitted_cycles` at most.
+
+        Args:
+            joints: Names of the joints.
+            permitted_rad: Distance that does not count.
+            permitted_cycles: Number of consecutive cycles with a larger distance that is no fault.
+        """
         self._joints = joints
         self._permitted_rad = permitted_rad
         self._permitted_cycles = permitted_cycles
         self._cycles = 0
-        self.place = ""  # the joint and its distance, readable; empty: none is off
+        self.place = ""
         self.fault: SegmentFault | None = None
 
     @property
@@ -100,20 +116,20 @@ class Straying:
         return self._cycles > 0
 
     def forget(self) -> None:
-        """Start counting anew."""
+        """Restart the count, and clear a fault."""
         self._cycles = 0
         self.place = ""
         self.fault = None
 
     def update(self, servo: DrivenArm) -> None:
-        """Process one status; set `fault` when a joint has been too far away for too long."""
-        away = np.abs(servo.position - servo.target)
-        if away.max() <= self._permitted_rad:
+        """Process one status. Sets `fault` when a joint has been too far away for too long."""
+        errors = np.abs(servo.position - servo.target)
+        if errors.max() <= self._permitted_rad:
             self.forget()
             return
         self._cycles += 1
-        joint = int(away.argmax())
-        self.place = f"joint '{self._joints[joint]}' is {away[joint]:.4f} rad from its set point"
+        joint = int(errors.argmax())
+        self.place = f"joint '{self._joints[joint]}' is {errors[joint]:.4f} rad from its set point"
         if self._cycles > self._permitted_cycles:
             self.fault = SegmentFault(
                 Error.FOLLOWING, f"{self.place}; valid: at most {self._permitted_rad} rad"

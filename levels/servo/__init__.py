@@ -1,6 +1,6 @@
-"""The servo level: torques at the clock's rate from set points of the level above.
+"""The servo level: computes torques at the clock's rate from set points of the level above.
 
-A law of your own derives from `ServoLaw`.
+Your own law derives from `ServoLaw`.
 """
 
 from rack.levels.servo.control import LawParams

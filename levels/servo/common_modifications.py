@@ -1,5 +1,6 @@
-"""Control modifications for any arm: a dead zone before the law, PD control in its place, a notch
-after it.
+"""Control modifications for any arm.
+
+`DeadZone` acts before the law, `JointPd` in place of it, and `Notch` after it.
 """
 
 from __future__ import annotations
@@ -9,7 +10,6 @@ import math
 import numpy as np
 from pydantic import Field
 
-from rack.levels.algebra import Array
 from rack.levels.errors import LevelError
 from rack.levels.servo.modification import Hook, LawContext, LawSample, Modification
 from rack.levels.tables import Positive, Table, read_params
@@ -23,8 +23,9 @@ class DeadZoneParams(Table):
 
 
 class DeadZone(Modification):
-    """Hides small position errors from the law, and reduces larger ones by as much: sticking joints
-    do not hunt.
+    """Hides small position errors from the law, and reduces larger ones by the same amount.
+
+    This keeps joints with friction from hunting around the set point.
     """
 
     hook = Hook.BEFORE
@@ -35,7 +36,7 @@ class DeadZone(Modification):
         self._width = read_params(DeadZoneParams, context.params).width
 
     def modify(self, sample: LawSample) -> None:
-        """Move the position seen towards the one wanted."""
+        """Move the position that the law sees towards the wanted one, by at most the width."""
         error = sample.wanted_position - sample.position
         sample.position += np.minimum(np.maximum(error, -self._width), self._width)
 
@@ -52,8 +53,9 @@ class JointPdParams(Table):
 
 
 class JointPd(Modification):
-    """Controls every joint by itself: PD on its error, without acceleration, coupling or
-    friction.
+    """Controls every joint by itself with PD on its error.
+
+    It ignores the wanted acceleration, coupling between joints and friction.
     """
 
     hook = Hook.INSTEAD
@@ -67,7 +69,7 @@ class JointPd(Modification):
         self._load = float(params.load)
 
     def modify(self, sample: LawSample) -> None:
-        """Set the torque."""
+        """Set the torques by PD, scaled by each joint's inertia."""
         error = sample.wanted_position - sample.position
         slip = sample.wanted_velocity - sample.velocity
         pull = sample.inertia * (self._stiffness * error + self._damping * slip)
@@ -90,13 +92,13 @@ class Notch(Modification):
     params = NotchParams
 
     def __init__(self, context: LawContext) -> None:
-        """Raise `LevelError` for a frequency that is not below half the law's rate."""
+        """Raise `LevelError` for a frequency that is not below half the rate of the law."""
         super().__init__(context)
         params = read_params(NotchParams, context.params)
         half_hz = 0.5 / context.period_s
         if params.frequency >= half_hz:
             raise LevelError(
-                f"params.frequency = {params.frequency:g} Hz: permitted: below half the law's rate,"
+                f"params.frequency = {params.frequency:g} Hz: must be below half the law's rate,"
                 f" {half_hz:g} Hz"
             )
         angle = 2.0 * math.pi * params.frequency * context.period_s
@@ -104,25 +106,21 @@ class Notch(Modification):
         alpha = math.sin(angle) / (2.0 * params.quality)
         self._feed = np.array([1.0, -2.0 * cosine, 1.0]) / (1.0 + alpha)
         self._back = np.array([-2.0 * cosine, 1.0 - alpha]) / (1.0 + alpha)
-        self._given: Array = np.zeros(
-            (2, len(context.joints))
-        )  # N m: the last two torques of the law, newest first
-        self._made: Array = np.zeros(
-            (2, len(context.joints))
-        )  # N m: likewise, without the frequency
+        # (2, joints), N m: the last two torques of the law and of the filter, newest first.
+        self._unfiltered, self._filtered = np.zeros((2, 2, len(context.joints)))
 
     def begin(self, sample: LawSample) -> None:
         """Start as if the torque had always been the present one."""
-        self._given[:] = self._made[:] = sample.torque
+        self._unfiltered[:] = self._filtered[:] = sample.torque
 
     def modify(self, sample: LawSample) -> None:
-        """Filter the torque."""
+        """Pass the torque through the filter."""
         now, one, two = self._feed
         back_one, back_two = self._back
-        made = now * sample.torque + one * self._given[0] + two * self._given[1]
-        made -= back_one * self._made[0] + back_two * self._made[1]
-        self._given[1] = self._given[0]
-        self._made[1] = self._made[0]
-        self._given[0] = sample.torque
-        self._made[0] = made
-        sample.torque = made
+        newer, older = self._unfiltered
+        torque = now * sample.torque + one * newer + two * older
+        torque -= back_one * self._filtered[0] + back_two * self._filtered[1]
+        for history, value in ((self._unfiltered, sample.torque), (self._filtered, torque)):
+            history[1] = history[0]
+            history[0] = value
+        sample.torque = torque

@@ -1,6 +1,4 @@
-"""The servo level's loops: computed torque for the joints, a position loop with limited force for
-the gripper.
-"""
+"""Control loops of the servo level: torques of the joints, and the force of the gripper."""
 
 from __future__ import annotations
 
@@ -33,13 +31,13 @@ class LoopGains(Table):
     """damping ratio of the error"""
 
     def fill(self, table: Array) -> None:
-        """Fill the first two rows of a law's constants: stiffness, 1/s2, and damping, 1/s."""
+        """Write stiffness, 1/s2, and damping, 1/s, to the first two rows of a law's constants."""
         table[0] = self.bandwidth**2
         table[1] = 2.0 * self.damping * self.bandwidth
 
 
 class ArmParams(Table):
-    """The arm that a board drives, and its reactions to faults of sensors and motors."""
+    """The class of the arm that a board drives, and the reactions to sensor and motor faults."""
 
     following: Positive = 0.02
     """distance of a joint from its set point at which a motor counts as failed, rad"""
@@ -48,7 +46,7 @@ class ArmParams(Table):
     on_actuator_fault: Reacting = "brake"
     """ramp to rest and hold, or ramp and brake, or brake"""
     good_cycles: int = Field(20, ge=1, le=10_000)
-    """good cycles in a row after which a fault is over"""
+    """consecutive good cycles after which a fault is over"""
     retry: Positive = 0.5
     """time after which a motor that gave too little is retried, or a struck arm resumes, s"""
     patience: Positive = 5.0
@@ -59,32 +57,33 @@ class ArmParams(Table):
     @field_validator("arm")
     @classmethod
     def _is_an_arm(cls, reference: str) -> str:
+        """Check that the class can be loaded and is an arm."""
         find_arm(reference)
         return reference
 
 
 class LawParams(ModifiableParams, ArmParams):
-    """`[board.servo.params]` of any servo law; a law of your own adds its own keys."""
+    """`[board.servo.params]` of any servo law; your own law adds its keys in a subclass."""
 
 
 class ServoParams(LawParams, LoopGains):
-    """`[board.servo.params]`: the arm, gains of the joint loop, and the reactions to faults of
-    sensors and motors.
-    """
+    """`[board.servo.params]`: the arm, gains of the joint loop, and the reactions to faults."""
 
 
 class ComputedTorque:
-    """torque = M (qdd + 2 d w (qd_wanted - qd) + w^2 (q_wanted - q)) + bias(q, qd) + dry friction;
-    M is the planner's.
+    """The computed-torque law, with the planner's inertia M.
 
-    Every joint's error is that of a damped oscillator in every state of the arm.
+    torque = M (qdd + 2 d w (qd_wanted - qd) + w^2 (q_wanted - q)) + bias(q, qd) + dry friction
+
+    In any pose and motion, the error of every joint decays like a damped oscillator.
 
     Attributes:
-        inertia: (joints, joints), kg m2, as planned; None: the present one is used.
+        inertia: Planned inertia, (joints, joints), kg m2. None uses the inertia at the sensed
+            state.
     """
 
     def __init__(self, friction: Array, gains: LoopGains) -> None:
-        """Compensate `friction`, (joints,), N m: dry."""
+        """Compensate the dry friction `friction`, (joints,), N m."""
         table = np.zeros((4, len(friction)))  # in the rows of `set_torque`
         self._constants = table
         self.tune(gains)
@@ -94,12 +93,19 @@ class ComputedTorque:
         self.inertia: Array | None = None
 
     def tune(self, gains: LoopGains) -> None:
-        """Use these gains from now on."""
+        """Use new gains from now on."""
         gains.fill(self._constants)
 
     def torque(self, wanted: Motion, sensed: SensedMotion, terms: Terms) -> Array:
-        """Return the torques, (joints,), N m, for the wanted motion; `terms` are those at the
-        sensed state. Valid until the next call.
+        """Return the torques for the wanted motion.
+
+        Args:
+            wanted: Motion to follow.
+            sensed: Sensed positions and velocities.
+            terms: Inertia and bias at the sensed state.
+
+        Returns:
+            Torques, (joints,), N m. The array is valid until the next call.
         """
         inertia = terms.inertia if self.inertia is None else self.inertia
         self._set(wanted.table, sensed.table, inertia, terms.bias)
@@ -114,8 +120,16 @@ def set_torque(
     inertia: Array,  # (joints, joints), kg m2
     bias: Array,  # (joints,), N m
 ) -> None:
-    """Set the torques of `ComputedTorque`."""
-    # 1/s2, 1/s; friction and, set here, torques, N m.
+    """Set the torques of `ComputedTorque` in the last row of `table`.
+
+    Args:
+        table: Stiffness, damping, dry friction and, as output, torques.
+        wanted: Positions, velocities and accelerations to follow.
+        state: Sensed positions and velocities.
+        inertia: Inertia that accelerates the joints.
+        bias: Torques of gravity and velocities.
+    """
+    # In 1/s2, 1/s, N m and N m. The torques are the output.
     stiffness, damping, dry, torque = table
     for j in range(len(torque)):
         torque[j] = bias[j] + dry[j] * math.tanh(wanted[1, j] / FRICTION_SPEED)
@@ -128,7 +142,7 @@ def set_torque(
 
 @compiled_for("f8[::1], f8[::1]")
 def limit_torques(torque: Array, limits: Array) -> bool:
-    """Cut torques, (joints,), N m, at their limits; return whether one was cut. NaN stays."""
+    """Cut torques, (joints,), N m, at their limits. NaN stays. Return True if one was cut."""
     cut = False
     for j in range(len(torque)):
         if abs(torque[j]) > limits[j]:
@@ -138,10 +152,11 @@ def limit_torques(torque: Array, limits: Array) -> bool:
 
 
 class SetPointLaw:
-    """The motion wanted at the end of a cycle, for drives that close loops of their own.
+    """Computes set points for drives that close a position or velocity loop.
 
-    To drives of velocity it adds the error of the position, which they do not know, as quickly as
-    `ComputedTorque` would.
+    A set point is the motion wanted at the end of the cycle. Velocity drives do not know the
+    position, so their set point also corrects the position error, as fast as `ComputedTorque`
+    would.
     """
 
     def __init__(self, cell: Cell, params: LoopGains, period_s: float) -> None:
@@ -150,12 +165,16 @@ class SetPointLaw:
         self.tune(params)
 
     def tune(self, gains: LoopGains) -> None:
-        """Use these gains from now on."""
+        """Use new gains from now on."""
         self._gain = 0.5 * gains.bandwidth / gains.damping if self._is_velocity else 0.0  # 1/s
 
     def target(self, wanted: Motion, position: Array, torque: Array) -> JointTarget:
-        """Return the set points for a motion, with the arm at `position`, (joints,), rad, and
-        `torque`, (joints,), N m, predicted.
+        """Return the set points for the end of this cycle.
+
+        Args:
+            wanted: Motion to follow.
+            position: Sensed positions, (joints,), rad.
+            torque: Predicted torques, (joints,), N m, which are passed on.
         """
         gained = self._period_s * wanted.acceleration
         return JointTarget(
@@ -166,10 +185,10 @@ class SetPointLaw:
 
 
 class Grip:
-    """The gripper's force, N or N m: a spring and damper to the commanded opening, limited to the
-    commanded force.
+    """Computes the gripper's force, N or N m.
 
-    Before the first set point the gripper opens or, after `keep`, keeps its force.
+    A spring and damper pull to the commanded opening, limited to the commanded force. Before the
+    first set point the gripper opens or, after `keep_force`, keeps its force.
     """
 
     def __init__(self, config: GripperConfig) -> None:
@@ -181,20 +200,26 @@ class Grip:
         self._kept: float | None = None
 
     def keep(self, force: float) -> None:
-        """Keep `force`, N or N m, until the first set point: the grip on an object must survive
-        a restart of the board.
+        """Keep `force`, N or N m, until the first set point.
+
+        A held object must not be dropped when the board restarts.
         """
         self._kept = force
 
     def take(self, command: ArmSetPoint) -> None:
-        """Take a new `JOINT_SET_POINT`."""
+        """Take opening and force from a new `JOINT_SET_POINT`."""
         if command.due != 0 and math.isfinite(command.opening) and math.isfinite(command.force):
             self._opening = min(max(command.opening, self._least), self._most)
             self._limit = min(max(command.force, 0.0), self._most_force)
             self._kept = None
 
     def force(self, opening: float, velocity: float) -> float:
-        """Return the force, N or N m, at `opening`, m or rad, and its `velocity`, in a second."""
+        """Return the force, N or N m.
+
+        Args:
+            opening: Sensed opening, m or rad.
+            velocity: Rate of the opening, m/s or rad/s.
+        """
         if self._kept is not None:
             return self._kept
         force = self._stiffness * (self._opening - opening) - self._damping * velocity

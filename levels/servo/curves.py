@@ -1,9 +1,10 @@
-"""Curves that the set point follows in joint space. Times are seconds from the curve's start;
-arrays are (joints,).
+"""Curves that the set point follows in joint space.
+
+Times are seconds from the start of the curve, arrays are (joints,).
 
 Every curve is a table of seven rows: the coefficients of a polynomial in u = time / duration,
-lowest first, and where the joints rest after it. So one compiled function gives the motion on any
-of them.
+lowest first, and the joint positions at rest after its end. So one compiled function evaluates all
+kinds of curves.
 """
 
 from __future__ import annotations
@@ -14,12 +15,13 @@ from rack.levels.algebra import Array
 from rack.levels.compiled import compiled_for
 
 REST = 6
-"""Row of a curve's table: where the joints rest after it."""
+"""Row of a curve's table that holds the joint positions at rest after its end."""
 
 
 class Motion:
-    """Joint positions, rad, velocities, rad/s, and accelerations, rad/s2, (joints,) each: the rows
-    of `table`.
+    """Positions, rad, velocities, rad/s, and accelerations, rad/s2, of the joints.
+
+    Each is (joints,), and one row of `table`.
     """
 
     __slots__ = ("acceleration", "position", "table", "velocity")
@@ -30,7 +32,7 @@ class Motion:
 
 
 class SensedMotion:
-    """Joint positions, rad, and velocities, rad/s, (joints,) each: the rows of `table`."""
+    """Positions, rad, and velocities, rad/s, of the joints: (joints,) each, rows of `table`."""
 
     __slots__ = ("position", "table", "velocity")
 
@@ -40,11 +42,16 @@ class SensedMotion:
 
 
 class Curve:
-    """A motion in time, for all joints, that goes over to rest at `ends_s`."""
+    """A motion of all joints over time, which may change to rest at `ends_s`."""
 
     def __init__(self, *coefficients: Array, duration_s: float, rest: Array | None = None) -> None:
-        """Take coefficients of u^0, u^1, ..., rad; without `rest`, rad, the motion goes on after
-        `duration_s`.
+        """Take polynomial coefficients.
+
+        Args:
+            coefficients: Of u^0, u^1, ..., (joints,) each, rad.
+            duration_s: Time at which u is 1.
+            rest: Positions at rest after `duration_s`, (joints,), rad. None continues the
+                polynomial.
         """
         self.table: Array = np.zeros((REST + 1, len(coefficients[0])))  # (7, joints), rad
         self.table[: len(coefficients)] = coefficients
@@ -54,7 +61,7 @@ class Curve:
             self.table[REST] = rest
 
     def at(self, time_s: float) -> Motion:
-        """Return the motion at `time_s` from 0 on."""
+        """Return the motion at `time_s`, which must be at least 0."""
         motion = Motion(np.zeros((3, self.table.shape[1])))
         set_motion.load()(self.table, self.duration_s, self.ends_s, time_s, 0.0, motion.table)
         return motion
@@ -64,8 +71,15 @@ class Curve:
 def set_motion(
     table: Array, duration_s: float, ends_s: float, time_s: float, ahead_s: float, motion: Array
 ) -> None:
-    """Set position, velocity and, `ahead_s` later, acceleration, (3, joints), to those on a
-    curve.
+    """Evaluate a curve: position and velocity at one time, acceleration somewhat later.
+
+    Args:
+        table: Table of the curve, (7, joints).
+        duration_s: Duration of the curve.
+        ends_s: Time at which the joints rest, or infinity.
+        time_s: Time for position and velocity.
+        ahead_s: Time after `time_s` for the acceleration.
+        motion: Output, (3, joints), rad, rad/s, rad/s2.
     """
     h = duration_s
     u = time_s / duration_s
@@ -93,28 +107,36 @@ def set_motion(
 
 
 class Bridge(Curve):
-    """The cubic from the motion on another curve to a position and a velocity."""
+    """The cubic curve from the motion on another curve to a position and a velocity."""
 
     def __init__(
         self, before: Curve, begin_s: float, end: tuple[Array, Array], duration_s: float
     ) -> None:
-        """Leave `before` at its `begin_s`; reach `end`, rad, rad/s, `duration_s` later."""
+        """Leave `before` at its time `begin_s`, and reach `end` after `duration_s`.
+
+        Args:
+            before: Curve to leave.
+            begin_s: Time on that curve.
+            end: Position, rad, and velocity, rad/s, to reach.
+            duration_s: Duration of the new curve.
+        """
         motion = before.at(begin_s)
         position, velocity = end
         first = motion.velocity * duration_s
         second = velocity * duration_s
-        way = position - motion.position
+        distance = position - motion.position
         super().__init__(
             motion.position,
             first,
-            3.0 * way - 2.0 * first - second,
-            first + second - 2.0 * way,
+            3.0 * distance - 2.0 * first - second,
+            first + second - 2.0 * distance,
             duration_s=duration_s,
         )
 
     def is_within(self, acceleration: Array) -> bool:
-        """Return whether no joint needs more than its `acceleration`, rad/s2: the need is greatest
-        at one of the ends.
+        """Return True if no joint exceeds its `acceleration`, (joints,), rad/s2.
+
+        The acceleration of a cubic is greatest at one of its ends.
         """
         begin = 2.0 * self.table[2] / self.duration_s**2
         end = (2.0 * self.table[2] + 6.0 * self.table[3]) / self.duration_s**2
@@ -122,28 +144,35 @@ class Bridge(Curve):
 
 
 class Ramp(Curve):
-    """From a velocity to rest, all joints at the same time, so that they stay on a straight line;
-    then rest.
+    """A motion from a velocity to rest.
+
+    All joints stop at the same time, so the arm stays on a straight line in joint space.
     """
 
     def __init__(self, start: Array, velocity: Array, acceleration: Array) -> None:
-        """Decelerate no joint harder than its `acceleration`, rad/s2."""
+        """Decelerate from `velocity`, rad/s, no joint harder than its `acceleration`, rad/s2."""
         duration_s = float(np.max(np.abs(velocity) / acceleration))
         half = 0.5 * velocity * duration_s
         super().__init__(start, 2.0 * half, -half, duration_s=duration_s, rest=start + half)
 
 
 class Decay(Curve):
-    """A difference in position and velocity that decays: a quintic that ends with all derivatives
-    zero; then 0.
+    """A difference in position and velocity that decays to zero.
+
+    It is a quintic that ends with zero velocity and acceleration.
     """
 
     def __init__(self, position: Array, velocity: Array, fastest: Array, hardest: Array) -> None:
-        """Last as long as it takes to add at most about `fastest`, rad/s, and `hardest`, rad/s2, to
-        a motion.
+        """Choose the duration by what the decay may add to a motion, approximately.
+
+        Args:
+            position: Initial difference, (joints,), rad.
+            velocity: Its initial rate, (joints,), rad/s.
+            fastest: Largest added velocity, (joints,), rad/s.
+            hardest: Largest added acceleration, (joints,), rad/s2.
         """
-        # Peaks of the quintic over a time T: 1.875 p / T in velocity; 5.774 p / T^2 + 3.94 v / T in
-        # acceleration.
+        # The quintic over a time T peaks at 1.875 p / T in velocity, and at 5.774 p / T^2 +
+        # 3.94 v / T in acceleration.
         linear = 3.94 * np.abs(velocity)
         by_acceleration = (
             linear + np.sqrt(linear**2 + 4.0 * 5.774 * hardest * np.abs(position))
@@ -160,13 +189,16 @@ class Decay(Curve):
 
 
 class Passage(Decay):
-    """From rest to rest at another place, all joints at the same time, straight in joint space;
-    then rest.
-    """
+    """A straight motion in joint space from rest to rest; all joints stop at the same time."""
 
     def __init__(self, start: Array, end: Array, fastest: Array, hardest: Array) -> None:
-        """Last as long as it takes to keep every joint within `fastest`, rad/s, and `hardest`,
-        rad/s2.
+        """Move from `start` to `end`, (joints,), rad, as quickly as the limits permit.
+
+        Args:
+            start: Position at rest before the motion.
+            end: Position at rest after it.
+            fastest: Velocity limits, (joints,), rad/s.
+            hardest: Acceleration limits, (joints,), rad/s2.
         """
         super().__init__(start - end, np.zeros_like(start), fastest, hardest)
         self.table[0] += end

@@ -1,45 +1,49 @@
-"""Whether the arm is enabled: asks its drives at the start or by an operator's command, and says
-what they wait for.
-"""
+"""Enables an arm at the start or by an operator's command, and takes over its pose."""
 
 from __future__ import annotations
 
 from collections.abc import Collection
+from dataclasses import dataclass
 
-from rack.levels.arm import DrivableArm, DriveState
-from rack.levels.level import LevelContext
+from rack.levels.arm import DrivableArm, DriveState, Sensed
+from rack.levels.level import LevelContext, Reading
+from rack.levels.messages import ArmState
 from rack.levels.operator import Operation, OperatorCommand
+from rack.levels.servo.sensor_monitor import SensorMonitor
+from rack.levels.servo.stopping import Stopping
 
 
 class Enabling:
-    """Follows the states of an arm's drives. Only an enabled arm is driven, and judged.
+    """Follows the states of an arm's drives. Only an enabled arm is driven and judged.
 
-    Whoever enables an arm sees it: after a fault, or after drives took their torque by themselves,
-    it must be enabled again. A restarted board finds the arm as it is, and asks for nothing.
+    Whoever enables an arm must be able to see it. So it must be enabled again after a fault, or
+    after the drives have switched off their torque themselves. A restarted board leaves the drives
+    as they are.
     """
 
     def __init__(self, arm: DrivableArm, context: LevelContext) -> None:
         robot = context.robot
         self._arm = arm
         self._at_start = robot.enable == "at-start" or (robot.enable is None and arm.keeps_limits)
-        self._say = f"rack command {context.rack} {context.board}"
+        self._command = f"rack command {context.rack} {context.board}"
         speed = f"{robot.bring_up or 1.0:.0%} of full speed"
-        self.slow = f"{speed}; to end that: {self._say} release"
+        self.slow = f"{speed}; to end that: {self._command} release"
         self._guessed = "" if arm.keeps_limits else ", ".join(robot.guessed)
-        self._restarted = False  # in the first cycle, in which old commands are read again
-        self._serial = 0  # of the newest command, while drives are on their way; 0: they are not
-        self._disables = False  # of the commands of a cycle, old ones too, the last one that counts
-        self._leaves = False  # its operator has disabled it, as its drives will show
-        self._goal: Collection[DriveState] = ()  # states in which it is done
+        self._restarted = False  # first cycle after a restart, in which old commands are read again
+        self._serial = 0  # serial of the newest command while the drives carry it out, else 0
+        # The last enable or disable command of a cycle, old ones included, is `disable`.
+        self._disables = False
+        self._leaves = False  # an operator has disabled the arm, which its drives may not show yet
+        self._goal: Collection[DriveState] = ()  # states in which the command is done
 
     def start(self, restarted: bool) -> None:
-        """Begin: ask for torque where that is not the operator's to do."""
+        """Enable the arm at the start, unless an operator must do so or the board was restarted."""
         self._restarted = restarted
         if self._at_start and not (restarted or self._guessed):
             self._arm.enable()
 
     def obey(self, command: OperatorCommand) -> str:
-        """Obey one of `rack.levels.operator.DRIVES`; return why not, empty: it does."""
+        """Obey one of `rack.levels.operator.DRIVES`. Return why it is refused, or an empty text."""
         arm = self._arm
         goal: Collection[DriveState] = list(DriveState)
         if command.what in (Operation.ENABLE, Operation.DISABLE):
@@ -63,7 +67,7 @@ class Enabling:
         return ""
 
     def arrived(self) -> int:
-        """Return the command, once, that wanted the drives where they are now; 0: none."""
+        """Return, once, the serial of a command when the drives have carried it out, else 0."""
         self._restarted = False
         if self._disables:
             self._disables = False
@@ -77,12 +81,12 @@ class Enabling:
 
     @property
     def is_enabled(self) -> bool:
-        """Whether the arm may be driven."""
+        """True if the arm may be driven."""
         return self._arm.state is DriveState.ENABLED and not self._leaves
 
     @property
     def reason(self) -> str:
-        """Why the arm is not enabled, and what enables it."""
+        """Why the arm is not enabled, and how to enable it."""
         state = self._arm.state
         if state is DriveState.FAULT:
             return f"drives: {self._arm.fault}; to go on: `reset`, then `enable`"
@@ -90,4 +94,46 @@ class Enabling:
             return "drives are being enabled"
         if self._guessed:
             return f"confirm, then remove from robot.guessed, before it is enabled: {self._guessed}"
-        return f"disabled; to enable: {self._say} enable"
+        return f"disabled; to enable: {self._command} enable"
+
+
+@dataclass
+class Takeover:
+    """Restores an arm after a restart, and adopts its pose while it is not enabled.
+
+    An arm that is not enabled may be moved by hand, and its drives may give no samples. So samples
+    are not checked against earlier ones until the arm is enabled and its pose has been adopted.
+    """
+
+    arm: DrivableArm
+    sensors: SensorMonitor
+    stopping: Stopping
+    enabling: Enabling
+    is_started: bool = False  # the first cycle has begun
+    is_complete: bool = False  # the arm is enabled, and its pose was adopted since
+
+    def start(self, before: Reading[ArmState]) -> bool:
+        """Start in the first cycle; return True if an arm was restored from its last state."""
+        self.is_started = True
+        self.enabling.start(before.is_there)
+        if before.is_there:
+            state = before.message
+            self.arm.restore(state)
+            self.sensors.recall(state)
+            self.stopping.recall(state)
+            self.is_complete = self.enabling.is_enabled
+        return before.is_there
+
+    def adopt(self, sensed: Sensed, tick: int) -> bool:
+        """Adopt the sensed pose unless the takeover is complete.
+
+        Returns:
+            True if the sample of this cycle can be checked: either the arm is enabled, or its pose
+            was just adopted.
+        """
+        is_enabled = self.enabling.is_enabled
+        if self.is_complete and is_enabled:
+            return True
+        is_adopted = self.sensors.adopt(sensed, tick)
+        self.is_complete = is_adopted and is_enabled
+        return is_adopted or is_enabled

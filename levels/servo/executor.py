@@ -1,4 +1,4 @@
-"""The servo level of NASREM: computed torque."""
+"""The servo level of NASREM: computed torque, or set points for drives that close a loop."""
 
 from __future__ import annotations
 
@@ -14,8 +14,9 @@ from rack.levels.servo.law import ServoLaw
 
 
 class ServoExecutor(ServoLaw):
-    """Follows joint set points by computed torque or, with drives that close loops of their own, by
-    set points for them.
+    """Follows joint set points by computed torque.
+
+    Drives that close a position or velocity loop themselves get set points instead of torques.
     """
 
     params: ClassVar[type[ServoParams]] = ServoParams
@@ -29,18 +30,18 @@ class ServoExecutor(ServoLaw):
             self.ahead = SetPointLaw(self.cell, self.settings, context.period_s)
 
     def take_plan(self, plan: ServoPlan) -> None:
-        """Take over what the gripper holds, and the inertia with it."""
+        """Take over the held object and the planned inertia."""
         super().take_plan(plan)
         self._loop.inertia = plan.inertia.copy()
 
     def _obey(self, command: OperatorCommand) -> str:
-        """Obey, with the gains as they are set then."""
-        why = super()._obey(command)
+        """Obey a command, and pass gains that it may have changed to the loops."""
+        refusal = super()._obey(command)
         self._loop.tune(self.settings)
         if self.ahead is not None:
             self.ahead.tune(self.settings)
-        return why
+        return refusal
 
     def torques(self, set_point: Motion, sensed: SensedMotion) -> Array:
-        """Return the torques, (joints,), N m. Valid until the next call."""
+        """Return the torques, (joints,), N m. The array is valid until the next call."""
         return self._loop.torque(set_point, sensed, self.terms)

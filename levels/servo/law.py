@@ -8,8 +8,8 @@ class PdServo(ServoLaw):
     def torques(self, set_point: Motion, sensed: SensedMotion) -> Array:
         error = set_point.position - sensed.position
         slip = set_point.velocity - sensed.velocity
-        gained = self.settings.stiffness * error + self.settings.damping * slip
-        return self.terms.inertia.diagonal() * gained + self.terms.bias
+        correction = self.settings.stiffness * error + self.settings.damping * slip
+        return self.terms.inertia.diagonal() * correction + self.terms.bias
 ```
 """
 
@@ -29,9 +29,10 @@ from rack.levels.messages import ArmState, JointCommand, ServoPlan, ServoStatus
 from rack.levels.operator import DRIVES, Goal, Operation, OperatorCommand
 from rack.levels.robot.dynamics import Payload
 from rack.levels.servo import control, curves, reference
+from rack.levels.servo.arm_report import SetPointStatus
 from rack.levels.servo.control import Grip, LawParams, limit_torques
 from rack.levels.servo.curves import Motion, SensedMotion
-from rack.levels.servo.driver import SCENES, ArmDriver, Course
+from rack.levels.servo.driver import SCENES, ArmDriver
 from rack.levels.servo.modification import misfits_of, names_of
 from rack.levels.servo.modified_law import LawInputs, ModifiedLaw
 from rack.levels.servo.operator_control import OperatorControl
@@ -41,15 +42,15 @@ from rack.levels.tables import set_live
 
 
 class ServoLaw(ArmDriver):
-    """Follows joint set points with the torques of a law: subclasses write `torques`.
+    """Follows joint set points with the torques of a law. Subclasses define `torques`.
 
     Safety comes first, an operator's command second, the level above third: see `ArmDriver`. Set
-    points are interpolated. Torques are cut at the motors' limits; one that is NaN engages the
-    brakes. The law's parameters, a subclass of `LawParams`, are in `settings`.
+    points are interpolated. Torques are cut at the motors' limits; a torque of NaN engages the
+    brakes. The parameters of the law, a subclass of `LawParams`, are in `settings`.
 
     Attributes:
-        terms: The equation of motion at the sensed state, with what the gripper holds: `inertia`,
-            (joints, joints), kg m2, and `bias`, (joints,), N m, of gravity and velocities.
+        terms: Equation of motion at the sensed state, with the payload: `inertia`, (joints,
+            joints), kg m2, and `bias`, (joints,), N m, torques of gravity and velocities.
     """
 
     above = Input(JointCommand, "above.command")
@@ -74,12 +75,11 @@ class ServoLaw(ArmDriver):
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         cell = self.cell
-        # Interpolates the set points.
         self.reference = Reference(cell.bounds, cell.limits, context.tick_s)
         self.reference.part = self.part
         self._limits = cell.bounds.torque
-        self._torque: Array = np.zeros(len(cell.home))  # (joints,), N m: of the law, limited
-        self._shape = self._torque.shape
+        # (joints,), N m: torques of the law after limiting.
+        self._torque: Array = np.zeros(len(cell.home))
         self._limit = limit_torques.load()
         self._cut = 0  # cycles in which a limit cut a torque of the law
         self._sensed = SensedMotion(self.sensors.state)
@@ -95,7 +95,7 @@ class ServoLaw(ArmDriver):
 
     @classmethod
     def names(cls, params: Mapping[str, Any]) -> Sequence[str]:
-        """Return the names of its control modifications."""
+        """Return the names of the control modifications."""
         return names_of(params)
 
     @classmethod
@@ -125,7 +125,7 @@ class ServoLaw(ArmDriver):
         """
 
     def take_messages(self) -> None:
-        """Take over what is new."""
+        """Process a new operator's command, plan or set point."""
         if self.operator.verdict is Verdict.NEW:
             self.operator_control.take(self.operator, self.sensors.position)
         if self.plan.verdict is Verdict.NEW:
@@ -139,39 +139,43 @@ class ServoLaw(ArmDriver):
                 self._grip.take(command)
 
     def take_plan(self, plan: ServoPlan) -> None:
-        """Take over what the gripper holds."""
+        """Take over the payload in the gripper."""
         self._holds = plan.held >= 0
         self._payload = Payload(plan.payload_mass, plan.payload_offset.copy())
 
     def _obey(self, command: OperatorCommand) -> str:
-        """Do what leaves the command in force as it is; return why not, empty: it does."""
+        """Obey a command that leaves the one in force unchanged.
+
+        Returns:
+            Why it is refused, or an empty text.
+        """
         if command.what == Operation.MODIFY:
             return self._modified.switch(command.name, command.goal == Goal.ON)
         if command.what == Operation.SET:
-            self.settings, why = set_live(self.settings, command.name)
-            return why
-        why = self.obey(command)
+            self.settings, refusal = set_live(self.settings, command.name)
+            return refusal
+        refusal = self.obey(command)
         self.reference.part = self.part
-        return why
+        return refusal
 
     def adopted(self) -> None:
-        """Forget the operator's way: the arm may have been moved away from it."""
+        """Forget the operator's way back, because the arm may have been moved away from it."""
         self.operator_control.forget()
 
     def started(self) -> None:
-        """Keep the grip on a part."""
+        """Keep the grip on a held part."""
         if self._grip is not None:
             self._grip.keep(self.arm.grip_force)
 
     def next_motion(self, reaction: Reaction, missed: bool, tick: int) -> Motion:
-        """Return the wanted motion; after braking it begins where the arm is."""
+        """Return the wanted motion. After braking it begins where the arm is."""
         sensors = self.sensors
         reference = self.reference
         if self.abandoned:
             reference.start(sensors.position, sensors.velocity, tick)
         elif self.ahead is not None and self.arm.braked:
-            # The first set point after brakes is where the arm is.
-            reference.meet(sensors.position, sensors.velocity, tick, astray=0.0)
+            # The first set point after braking must be exactly where the arm is.
+            reference.meet(sensors.position, sensors.velocity, tick, tolerance_rad=0.0)
         elif missed:
             reference.meet(sensors.position, sensors.velocity, tick)
         if reaction:
@@ -186,30 +190,30 @@ class ServoLaw(ArmDriver):
         """Return the torques, N m, and the grip force, N."""
         grip = self._grip
         grip_force = 0.0 if grip is None else grip.force(sensed.opening, sensed.opening_velocity)
-        # What is predicted for set points is the torque of an arm that is there.
+        # For set points the torques are predicted, as if the arm were at its set point.
         state = self._sensed if self.ahead is None else SensedMotion(wanted.table[:2])
         if not self._modified.exists:
             return self._limited(wanted, state), grip_force
         terms = self.terms
-        given = LawInputs(
+        inputs = LawInputs(
             wanted, state.table, np.diagonal(terms.inertia), terms.bias, self.arm.tick
         )
         return self._modified.torque(
-            lambda motion, seen: self._limited(motion, SensedMotion(seen)), given
+            lambda motion, seen: self._limited(motion, SensedMotion(seen)), inputs
         ), grip_force
 
     def _limited(self, set_point: Motion, sensed: SensedMotion) -> Array:
         """Return the torques of the law, cut at their limits. Valid until the next call.
 
         Raises:
-            LevelError: `torques` returned something else than one number for each joint.
+            LevelError: `torques` did not return one number for each joint.
         """
         torque = self._torque
-        found = self.torques(set_point, sensed)
-        if getattr(found, "shape", None) != self._shape:
-            shapes = f"shape {np.shape(found)}; expected {self._shape}, one for each joint"
+        unlimited = self.torques(set_point, sensed)
+        if getattr(unlimited, "shape", None) != torque.shape:
+            shapes = f"shape {np.shape(unlimited)}; expected {torque.shape}, one for each joint"
             raise LevelError(f"class {type(self).__name__}: torques() returned {shapes}")
-        torque[:] = found
+        torque[:] = unlimited
         if self._limit(torque, self._limits):
             self._cut += 1
         return torque
@@ -221,27 +225,25 @@ class ServoLaw(ArmDriver):
 
     @property
     def payload(self) -> Payload | None:
-        """What the gripper holds, by the plan."""
+        """Payload in the gripper according to the plan."""
         return self._payload
 
     @property
     def holds(self) -> bool:
-        """Whether the gripper holds a part, by the plan."""
+        """True if the gripper holds a part according to the plan."""
         return self._holds
 
-    @property
-    def note(self) -> str:
-        """How the law is modified."""
-        return self._modified.reason
-
-    def course(self, reaction: Reaction) -> Course:
-        """Return what the status says of set points."""
+    def course(self, reaction: Reaction) -> SetPointStatus:
+        """Return how the level follows its set points, for the status."""
         operator = self.operator_control
         stands = operator.stands
         cut = self.reference.refused + self._cut
-        kept = self.stopping.reason
-        if stands and not kept:
-            kept = operator.reason
+        reason = self.stopping.reason
+        if stands and not reason:
+            reason = operator.reason
         holding = self.abandoned or self.reference.holding
         stopped = self.abandoned or reaction > 0 or stands
-        return Course(self.followed, holding, stopped, cut, kept)
+        note = self._modified.reason
+        return SetPointStatus(
+            self.followed, holding, stopped, cut, reason, has_work=self.followed > 0, note=note
+        )

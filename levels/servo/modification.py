@@ -1,16 +1,16 @@
-"""Control modifications ("cmods"): a user's own function before, in place of, or after a servo law.
+"""Control modifications ("cmods"): a user's function before, in place of, or after a servo law.
 
-A modification is a class in the user's own package, named in the parameters of a board with a servo
-law:
+A modification is a class in the user's own package. The parameters of a board with a servo law name
+it:
 
     [board.servo.params.modifications.friction]
     class = "my_package.my_module:Friction"
     on = false
     params = { torque = 2.0 }
 
-It is put in and taken out between two samples, by `on` at the start and by an operator's command at
-a tick. See `rack.levels.servo.modified_law` for the switch without a step, and for what happens to
-one that fails.
+It is switched on and off between two samples: from the start if `on` is true, later by an
+operator's command. `rack.levels.servo.modified_law` describes how switching avoids a step in the
+torque, and what happens to a modification that fails.
 """
 
 from __future__ import annotations
@@ -33,28 +33,30 @@ from rack.levels.tables import Positive, Table, named_class, read_params
 
 
 class Hook(StrEnum):
-    """Places of a modification around a servo law."""
+    """Positions of a modification relative to the servo law."""
 
-    BEFORE = "before"  # changes the motion wanted, or the state, as the law sees them
+    BEFORE = "before"  # changes the wanted motion or the state before the law sees it
     INSTEAD = "instead"  # sets the torque in place of the law
     AFTER = "after"  # changes the law's torque
 
 
 class LawContext(NamedTuple):
-    """The servo law as a modification knows it. Vectors are (joints,), of all joints of the arm."""
+    """Facts about the servo law that a modification may need.
 
-    joints: Sequence[str]  # names
-    period_s: float  # from sample to sample, unless cycles are missed
-    torque: Array  # N m: limits, which stay in force after every modification
-    params: Mapping[str, Any]  # of the modification, as given
+    Vectors are (joints,), for all joints of the arm.
+    """
+
+    joints: Sequence[str]  # names of the joints
+    period_s: float  # time between samples, unless cycles are missed
+    torque: Array  # N m: torque limits, which also apply after every modification
+    params: Mapping[str, Any]  # params of the modification in the config
 
 
 class LawSample:
-    """One sample of a servo law. Vectors are (joints,), of all joints of the arm; assigning to one
-    fills it.
+    """One sample of a servo law.
 
-    Joints that the board does not drive have values without a meaning; what becomes of them is
-    ignored.
+    Vectors are (joints,), for all joints of the arm; assigning to one fills it in place. Values of
+    joints that the board does not drive are meaningless, and changes to them are ignored.
     """
 
     __slots__ = (
@@ -72,24 +74,22 @@ class LawSample:
     )
 
     def __init__(self, joints: int) -> None:
-        self.tick = 0  # of the sample
-        self.seen: Array = np.zeros(
-            (5, joints)
-        )  # what the law sees: the next five, which are its rows
-        self.wanted_position, self.wanted_velocity, self.wanted_acceleration = self.seen[
-            :3
-        ]  # rad, rad/s, rad/s2
-        self.position, self.velocity = self.seen[3:]  # rad, rad/s: sensed
+        self.tick = 0  # tick of the sample
+        # Inputs of the law. Its rows are the next five vectors, in rad, rad/s, rad/s2, rad, rad/s.
+        self.seen: Array = np.zeros((5, joints))
+        self.wanted_position, self.wanted_velocity, self.wanted_acceleration = self.seen[:3]
+        self.position, self.velocity = self.seen[3:]  # sensed
         self.motion = Motion(self.seen[:3])
         self.inertia: Array = np.zeros(joints)  # kg m2: diagonal of the joint-space inertia
-        self.load: Array = np.zeros(
-            joints
-        )  # N m: torque of gravity and motion, without acceleration and dry friction
-        self.torque: Array = np.zeros(joints)  # N m: the law's; NaN before it, and in its place
+        # N m: torques of gravity and velocities, without acceleration and dry friction.
+        self.load: Array = np.zeros(joints)
+        # N m: torques of the law. They are NaN for modifications before the law or in its place.
+        self.torque: Array = np.zeros(joints)
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """Fill a vector in place: `sample.torque = 0.9 * sample.torque` changes what the law's
-        caller sees.
+        """Fill vectors in place, so that the caller of the law sees the change.
+
+        For example, `sample.torque = 0.9 * sample.torque` scales the torques that the arm gets.
         """
         if isinstance(getattr(self, name, None), np.ndarray):
             getattr(self, name)[...] = value
@@ -98,52 +98,57 @@ class LawSample:
 
 
 class Modification(ABC):
-    """A control modification. Subclasses declare their hook, and write `modify`."""
+    """A control modification. Subclasses declare their hook and define `modify`."""
 
     hook: ClassVar[Hook]
     params: ClassVar[type[Table] | None] = None
-    """Keys of its `params` in the config, checked before the launch; None: it takes none."""
+    """Table of its `params` in the config, checked before the launch. None if it takes none."""
 
     def __init__(self, context: LawContext) -> None:
-        """Raise `LevelError` for params that do not suit the law: `rack check` reports it."""
+        """Raise `LevelError` for params that do not suit the law; `rack check` reports it."""
         self.context = context
 
     def begin(self, sample: LawSample) -> None:
-        """Start anew in the first sample after it is put in, before `modify`. Default: nothing."""
+        """Reset internal state. Called in the first sample after switching on, before `modify`.
+
+        The default does nothing.
+        """
 
     @abstractmethod
     def modify(self, sample: LawSample) -> None:
-        """Change one sample, in bounded time: what the law sees, or the torque, by the hook.
+        """Change one sample in bounded time: the law's inputs or the torque, depending on the hook.
 
-        An exception, or a value that is not finite, undoes the change and takes the modification
-        out.
+        After an exception or a result that is not finite, the change is undone and the modification
+        is switched off.
         """
 
 
 class ModificationConfig(Table):
-    """`[board.<name>.params.modifications.<modification>]`: one modification of the board's servo
-    law.
-    """
+    """`[board.<name>.params.modifications.<modification>]`: one modification of a servo law."""
 
     cls: str = Field(alias="class")
     """subclass of rack.levels.servo.Modification, package.module:Class"""
     on: bool = False
-    """put in from the start"""
+    """switched on from the start"""
     params: dict[str, Any] = {}
     """parameters of the modification, declared by its class"""
 
     @field_validator("cls")
     @classmethod
     def _has_a_hook(cls, reference: str) -> str:
+        """Check that the class can be loaded and declares a valid hook."""
         hook = getattr(named_class(reference, Modification), "hook", None)
-        known = [str(hook) for hook in Hook]
-        if hook not in known:
+        hooks = [str(hook) for hook in Hook]
+        if hook not in hooks:
             name = reference.partition(":")[2]
-            raise ValueError(f"class '{name}' has the hook {hook!r}; permitted: {', '.join(known)}")
+            raise ValueError(
+                f"class '{name}' has the hook {hook!r}; must be one of {', '.join(hooks)}"
+            )
         return reference
 
     @model_validator(mode="after")
     def _fits_its_class(self) -> ModificationConfig:
+        """Check the params against the table that the class declares."""
         kind = self.kind.params
         if kind is None:
             if self.params:
@@ -157,7 +162,7 @@ class ModificationConfig(Table):
 
     @property
     def kind(self) -> type[Modification]:
-        """The class."""
+        """The class of the modification."""
         return named_class(self.cls, Modification)
 
 
@@ -172,29 +177,31 @@ class ModifiableParams(Table):
     modifications: dict[ModificationName, ModificationConfig] = {}
     """control modifications by name, in the order in which they act"""
     transfer: Positive = Field(0.05, le=10.0)
-    """time in which the torque goes over to that of a law modified otherwise, s"""
+    """time in which the torque changes over after a modification is switched, s"""
 
     @field_validator("modifications")
     @classmethod
-    def _one_instead(cls, found: dict[str, ModificationConfig]) -> dict[str, ModificationConfig]:
-        first = [
-            name for name, entry in found.items() if entry.on and entry.kind.hook == Hook.INSTEAD
+    def _one_instead(cls, entries: dict[str, ModificationConfig]) -> dict[str, ModificationConfig]:
+        """Check that at most one modification replaces the law from the start."""
+        active = [
+            name for name, entry in entries.items() if entry.on and entry.kind.hook == Hook.INSTEAD
         ]
-        if len(first) > 1:
-            raise ValueError(f"{', '.join(first)} are on in place of the law; permitted: one")
-        return found
+        if len(active) > 1:
+            raise ValueError(f"only one may be on in place of the law, not {', '.join(active)}")
+        return entries
 
 
 def names_of(params: Mapping[str, Any]) -> Sequence[str]:
-    """Return the names of the modifications in a board's parameters, valid or not: see
-    `Executor.names`.
+    """Return the names of the modifications in a board's parameters, for `Executor.names`.
+
+    The parameters need not be valid.
     """
-    found = params.get("modifications")
-    return tuple(found) if isinstance(found, Mapping) else ()
+    table = params.get("modifications")
+    return tuple(table) if isinstance(table, Mapping) else ()
 
 
 def misfits_of(context: LevelContext) -> Misfits:
-    """Yield the modifications of a board that do not suit its law: see `Executor.misfits`."""
+    """Yield the modifications of a board that do not suit its law, for `Executor.misfits`."""
     params = read_params(
         ModifiableParams, {"modifications": context.params.get("modifications", {})}
     )

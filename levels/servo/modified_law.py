@@ -1,15 +1,15 @@
-"""A servo law with control modifications, which are switched between two samples without a step in
-the torque.
+"""A servo law with control modifications, which are switched without a step in the torque.
 
-In the first sample after a switch the torque is that of the sample before it. Its difference from
-the torque of the law as now modified decays to zero, with zero slope at both ends, while the new
-law is already in force. So a switch adds nothing to the torque but this difference, whatever the
-modifications compute; limits apply to the sum. Alternatives considered: to evaluate old and new law
-in one sample (a modification with state would act twice), and a ramp of gains (it must know what is
-inside the law).
+In the first sample after a switch the torque does not change. The difference from the torque of the
+newly modified law decays to zero, with zero slope at both ends, while the new law is already in
+force. A switch therefore adds only this difference, whatever the modifications compute. Torque
+limits apply to the sum.
 
-A modification that raises an exception, or whose result is not finite, is undone and taken out in
-the same sample: the law goes on without it, and the torque goes over to it in the same way.
+Two alternatives were rejected. Evaluating the old and the new law in one sample would run a
+modification with state twice. A ramp of gains would have to know the inside of the law.
+
+A modification that raises an exception, or whose result is not finite, is undone and switched off
+in the same sample, with the same smooth change of the torque.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ Law = Callable[[Motion, Array], Array]
 
 
 class LawInputs(NamedTuple):
-    """What a law is given in one sample. Vectors are (joints,); see `LawSample`."""
+    """Inputs of a law in one sample. Vectors are (joints,); see `LawSample`."""
 
     motion: Motion  # wanted
     state: Array  # (2, joints): rad, rad/s
@@ -48,37 +48,49 @@ class LawInputs(NamedTuple):
 
 @dataclass
 class Modified:
-    """One modification of a law, put in or not."""
+    """One modification of a law, switched on or off."""
 
     number: int
     name: str
     modification: Modification
     is_on: bool
-    begins: bool = True  # the next sample is its first
+    begins: bool = True  # the next sample is the first after it was switched on
 
     def act(self, sample: LawSample, changed: Array) -> str:
-        """Modify a sample, of which it changes one array; return why that failed, empty: it did
-        not.
+        """Modify a sample.
+
+        Args:
+            sample: Sample of the law.
+            changed: Array of the sample that the modification may change; restored after a failure.
+
+        Returns:
+            Why the modification failed, or an empty text.
         """
-        kept = changed.copy()
-        why = ""
+        original = changed.copy()
+        failure = ""
         try:
             if self.begins:
                 self.begins = False
                 self.modification.begin(sample)
             self.modification.modify(sample)
         except Exception as error:  # a user's code may raise anything
-            why = f"{type(error).__name__}: {error}"
+            failure = f"{type(error).__name__}: {error}"
         else:
             if not np.isfinite(changed).all():
-                why = "its result is not finite"
-        if why:
-            changed[:] = kept
-        return why
+                failure = "its result is not finite"
+        if failure:
+            changed[:] = original
+        return failure
 
 
 class ModifiedLaw:
-    """Modifies one law. `reason` says which modifications are in, and which have failed."""
+    """Applies control modifications to one law.
+
+    Attributes:
+        exists: There are modifications, switched on or off. Otherwise the law may be called
+            directly.
+        reason: Names of the active modifications, and why others have failed.
+    """
 
     def __init__(
         self,
@@ -87,10 +99,17 @@ class ModifiedLaw:
         torque: Array,
         findings: list[Finding],
     ) -> None:
-        """Limit torques to `torque`, (joints,), N m; report failures as `findings`."""
+        """Create the modifications that the parameters declare.
+
+        Args:
+            context: Context of the level.
+            params: Parameters of the board.
+            torque: Torque limits, (joints,), N m.
+            findings: List to which failures of modifications are added.
+        """
         joints = context.robot.joints
         period_s = context.period_s
-        self.exists = bool(params.modifications)  # without one, `torque` is the law's
+        self.exists = bool(params.modifications)
         self._all = {
             name: Modified(
                 number,
@@ -105,37 +124,48 @@ class ModifiedLaw:
         self._findings = findings
         self._sample = LawSample(len(joints))
         self._last = np.zeros(len(joints))  # N m: torque of the last sample
-        self._difference = np.zeros(len(joints))  # N m: from the law's torque to it, at the switch
-        self._since: int | None = None  # tick of the switch; None: the difference has decayed
+        # N m: torque before the last switch, minus the torque of the law after it.
+        self._difference = np.zeros(len(joints))
+        self._since: int | None = None  # tick of the switch, None once the difference has decayed
         self._is_driving = False  # the last sample's torque was given to the arm
-        self._switched = False  # after the last sample
-        self._failed: dict[str, str] = {}  # why, by name, for those taken out
+        self._switched = False  # a modification was switched after the last sample
+        self._failed: dict[str, str] = {}  # reason of each failure, by name
         self._arrange()
 
     def switch(self, name: str, is_on: bool) -> str:
-        """Put a modification in, or take it out, with the next sample; return why that is refused,
-        empty: it is not.
+        """Switch a modification on or off from the next sample.
+
+        Returns:
+            Why that is refused, or an empty text.
         """
-        one = self._all.get(name)
-        if one is None:
+        state = self._all.get(name)
+        if state is None:
             return f"no modification '{name}'; permitted: {', '.join(self._all) or 'none'}"
-        if is_on != one.is_on or one.name in self._failed:
-            self._failed.pop(one.name, None)
-            if is_on and one.modification.hook == Hook.INSTEAD:
+        if is_on != state.is_on or state.name in self._failed:
+            self._failed.pop(state.name, None)
+            if is_on and state.modification.hook == Hook.INSTEAD:
                 for other in self._hooked(Hook.INSTEAD):
                     other.is_on = False
-            one.is_on = one.begins = is_on
+            state.is_on = state.begins = is_on
             self._arrange()
         return ""
 
     def interrupt(self) -> None:
-        """Forget the last torque: the arm was braked."""
+        """Forget the last torque, because the arm was braked."""
         self._is_driving = False
 
-    def torque(self, law: Law, given: LawInputs) -> Array:
-        """Return the torques, (joints,), N m, of `law` as modified. Valid until the next call."""
-        torque = self._modified(law, given) if self._in else law(given.motion, given.state)
-        tick = given.tick
+    def torque(self, law: Law, inputs: LawInputs) -> Array:
+        """Return the torques of the modified law.
+
+        Args:
+            law: Unmodified law.
+            inputs: Its inputs in this sample.
+
+        Returns:
+            Torques, (joints,), N m. The array is valid until the next call.
+        """
+        torque = self._modified(law, inputs) if self._in else law(inputs.motion, inputs.state)
+        tick = inputs.tick
         if self._switched:
             self._switched = False
             self._since = tick if self._is_driving else None
@@ -146,47 +176,50 @@ class ModifiedLaw:
         self._is_driving = True
         return self._last
 
-    def _modified(self, law: Law, given: LawInputs) -> Array:
+    def _modified(self, law: Law, inputs: LawInputs) -> Array:
+        """Run the active modifications around, or in place of, the law; return the torques."""
         sample = self._sample
-        sample.tick = given.tick
-        sample.inertia = given.inertia
-        sample.load = given.load
-        sample.seen[:3] = given.motion.table
-        sample.seen[3:] = given.state
+        sample.tick = inputs.tick
+        sample.inertia = inputs.inertia
+        sample.load = inputs.load
+        sample.seen[:3] = inputs.motion.table
+        sample.seen[3:] = inputs.state
         sample.torque[:] = np.nan
-        for one in self._before:
-            self._act(one, sample.seen)
-        if not any(self._act(one, sample.torque) for one in self._instead):
+        for state in self._before:
+            self._act(state, sample.seen)
+        if not any(self._act(state, sample.torque) for state in self._instead):
             sample.torque = law(sample.motion, sample.seen[3:])
-        for one in self._after:
-            self._act(one, sample.torque)
+        for state in self._after:
+            self._act(state, sample.torque)
         return sample.torque
 
-    def _act(self, one: Modified, changed: Array) -> bool:
-        why = one.act(self._sample, changed)
-        if why:
-            one.is_on = False
-            self._failed[one.name] = why
-            self._findings.append(Finding(Alarm.MODIFICATION, one.number))
+    def _act(self, state: Modified, changed: Array) -> bool:
+        """Apply one modification; switch it off if it fails. Return True if it succeeded."""
+        failure = state.act(self._sample, changed)
+        if failure:
+            state.is_on = False
+            self._failed[state.name] = failure
+            self._findings.append(Finding(Alarm.MODIFICATION, state.number))
             self._arrange()
-        return not why
+        return not failure
 
     def _go_over(self, torque: Array, ticks: int) -> Array:
-        """Return the torque with what is left of the difference, `ticks` after the switch."""
-        passed = ticks / self._ticks
+        """Return the torque plus what is left of the difference, `ticks` after the switch."""
+        passed = ticks / self._ticks  # part of the transfer
         if passed >= 1.0:
             self._since = None
             return torque
         return torque + (1.0 - passed) ** 2 * (1.0 + 2.0 * passed) * self._difference
 
     def _hooked(self, hook: Hook) -> Sequence[Modified]:
-        return [one for one in self._in if one.modification.hook == hook]
+        """Return the active modifications with a hook, in the order of the config."""
+        return [state for state in self._in if state.modification.hook == hook]
 
     def _arrange(self) -> None:
-        """Take over a switch."""
-        self._in = [one for one in self._all.values() if one.is_on]
+        """Sort the active modifications by hook, and describe them in `reason`."""
+        self._in = [state for state in self._all.values() if state.is_on]
         self._before, self._instead, self._after = (self._hooked(hook) for hook in Hook)
         self._switched = True
         failed = [f"modification '{name}' taken out: {why}" for name, why in self._failed.items()]
-        into = [f"modified by {', '.join(one.name for one in self._in)}"] if self._in else []
-        self.reason = "; ".join(failed + into)
+        active = [f"modified by {', '.join(state.name for state in self._in)}"] if self._in else []
+        self.reason = "; ".join(failed + active)

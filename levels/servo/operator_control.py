@@ -1,6 +1,4 @@
-"""An operator's commands to the servo level: hold, or move the joints to a set point, and later
-return the same way.
-"""
+"""An operator's commands to the servo level: hold, move the joints, and return the same way."""
 
 from __future__ import annotations
 
@@ -24,11 +22,15 @@ from rack.levels.servo.reference import Reference
 
 
 class OperatorControl:
-    """Follows the operator.
+    """Follows the commands of the operator.
 
     To resume, the arm returns through the places from which it set out: that way was free, and the
-    level above finds the arm on its path. A restarted board has lost these places: the level above
+    level above finds the arm on its path. A restarted board has lost these places; the level above
     then continues from where the arm is.
+
+    Attributes:
+        orders: The commands in force.
+        stands: The level follows the operator instead of the level above.
     """
 
     def __init__(
@@ -40,22 +42,26 @@ class OperatorControl:
         *,
         obey: Callable[[OperatorCommand], str],
     ) -> None:
-        """Permit set points of the joints `driven`, (joints,), default all, within `ranges`
-        (joints, 2), rad.
+        """Permit set points of some joints.
 
-        `obey` obeys a command that leaves the one in force as it is, or returns why not.
+        Args:
+            commands: Commands that the level accepts.
+            joints: Names of all joints.
+            ranges: Permitted positions, (joints, 2), rad.
+            driven: Joints that the operator may move, (joints,). None permits all.
+            obey: Obeys a command that leaves the one in force unchanged, or returns why not.
         """
         self.orders = Orders(commands)
-        self.stands = False  # the level follows the operator, not the level above
+        self.stands = False
         self._driven = np.full(len(joints), True) if driven is None else driven
-        self._joints = [joint for joint, own in zip(joints, self._driven, strict=True) if own]
+        self._joints = [name for name, drives in zip(joints, self._driven, strict=True) if drives]
         self._ranges = ranges[self._driven]
         self._obey = obey
-        self._position = np.zeros(len(joints))  # (joints,), rad: of the arm, at the newest command
+        # (joints,), rad: position of the arm at the newest command.
+        self._position = np.zeros(len(joints))
         self._goal: Array | None = None  # (joints,), rad
-        self._way: list[
-            Array
-        ] = []  # (joints,), rad each: places from which the arm set out, oldest first
+        # (joints,), rad each: places from which the arm set out, oldest first.
+        self._way: list[Array] = []
 
     def take(self, operator: Reading[OperatorCommand], position: Array) -> None:
         """Accept new commands, with the arm at `position`, (joints,), rad."""
@@ -67,35 +73,35 @@ class OperatorControl:
         self.stands = self.orders.stands or bool(self._way)
 
     def forget(self) -> None:
-        """Forget the way back: the level above continues from where the arm is."""
+        """Forget the way back, so that the level above continues from where the arm is."""
         self._way.clear()
 
     @property
     def reason(self) -> str:
-        """Why the arm does not follow the level above; empty: it does."""
+        """Why the arm does not follow the level above. Empty if it does."""
         if not self.stands:
             return ""
         if not self.orders.stands:
             return "returning to where the operator took over, then follows the level above"
-        what = "held" if self.orders.holds else f"at the {self.orders.standing.name.lower()}"
-        return f"{what} by the operator; `resume` releases it"
+        state = "held" if self.orders.holds else f"at the {self.orders.standing.name.lower()}"
+        return f"{state} by the operator; `resume` releases it"
 
     def _judge(self, command: OperatorCommand) -> None:
-        """Take the goal of a set point, or refuse it; do what leaves the command in force."""
+        """Accept the goal of a set point or refuse it; obey settings and drive commands."""
         if command.what in (*SETTINGS, *DRIVES):
-            if why := self._obey(command):
-                self.orders.refuse(why)
+            if refusal := self._obey(command):
+                self.orders.refuse(refusal)
         elif self.orders.standing is Operation.SETPOINT:
             try:
-                own = joints_of(command, self._joints, self._ranges)
+                positions = joints_of(command, self._joints, self._ranges)
             except ValueError as error:
                 self.orders.refuse(str(error))
             else:
                 self._goal = self._position.copy()
-                self._goal[self._driven] = own
+                self._goal[self._driven] = positions
 
     def wanted(self, reference: Reference, tick: int) -> Motion:
-        """Return the motion wanted at `tick`, while the level follows the operator."""
+        """Return the motion wanted at `tick` while the level follows the operator."""
         returns = self._way and not self.orders.stands
         goal = self._way[-1] if returns else None
         if self.orders.standing is Operation.SETPOINT:
@@ -108,7 +114,7 @@ class OperatorControl:
             if reference.goal is not before and self.orders.standing is Operation.SETPOINT:
                 self._way.append(motion.position.copy())
         if not motion.velocity.any() and (goal is None or np.array_equal(motion.position, goal)):
-            # React to the arm's arrival at its goal.
+            # The motion has arrived at its goal.
             if returns:
                 self._way.pop()
             if self.orders.stands or not self._way:

@@ -13,7 +13,7 @@ from rack.levels.robot.dynamics import Dynamics, Payload
 
 
 class ServoPlanner(Planner):
-    """Plans the inertia at the set point due next, with the object held, at every release."""
+    """Plans the inertia at the next set point, including a held object, at every release."""
 
     above = Input(JointCommand, "above.command")
     status = Input(ServoStatus, "own.status")
@@ -37,14 +37,14 @@ class ServoPlanner(Planner):
         return True
 
     def plan(self, tick: int) -> None:
-        """Fill a `ServoPlan`."""
+        """Compute the inertia and the payload, and write them to the `ServoPlan`."""
         command = self.above.message
         held = -1
         payload = Payload(0.0, np.zeros(3))
         if command.due != 0 and self.scene.is_there and 0 <= command.held < self._objects:
             held = command.held
             payload = self._payload(self.scene.message, held)
-        # Plan for the set point due, else for where the arm is, else for home.
+        # Use the next set point, else the sensed position, or home before the first status.
         position = self._home
         if command.due != 0 and np.isfinite(command.position).all():
             position = command.position
@@ -56,7 +56,15 @@ class ServoPlanner(Planner):
         self.output.payload_offset = payload.offset
 
     def _payload(self, scene: Scene, held: int) -> Payload:
-        """Return mass and centre, in the frame of the tool, of an object as the scene shows it."""
+        """Return the payload that an object puts on the tool, from its pose in the scene.
+
+        Args:
+            scene: Poses of the objects and the tool.
+            held: Row of the object in the gripper.
+
+        Returns:
+            Mass, kg, and its centre in the frame of the tool, m.
+        """
         mujoco.mju_quat2Mat(self._rotation, scene.quaternion[held])
         centre = scene.position[held] + mat_vec(self._rotation.reshape(3, 3), self._centres[held])
         mujoco.mju_quat2Mat(self._rotation, scene.tool_quaternion)

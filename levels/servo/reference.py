@@ -1,8 +1,8 @@
-"""The set point of every servo cycle, interpolated between the set points of the level above.
+"""Interpolates the set points of the level above for every servo cycle.
 
-A set point is to be reached at its `due` tick; the next one has arrived by then. In between, the
-motion is the cubic Hermite curve through positions and velocities, so it is C1. If none arrives in
-time, the motion ramps to rest; when set points resume, it joins them smoothly.
+A set point is to be reached at its `due` tick, and the next one should arrive before that. In
+between, the motion is the cubic Hermite curve through positions and velocities, so it is C1. If no
+set point arrives in time, the motion ramps to rest; when set points resume, it joins them smoothly.
 """
 
 from __future__ import annotations
@@ -17,15 +17,14 @@ from rack.levels.robot.limits import Bounds, Limits
 from rack.levels.servo.curves import Bridge, Curve, Decay, Motion, Passage, Ramp, set_motion
 
 MAX_ACCELERATION = 2.0
-"""Multiple of the acceleration limits that the curve between two set points may need: planned
-motion, interpolated, needs a little more than 1."""
+"""Multiple of the acceleration limits that the curve between two set points may need. Interpolation
+of a planned motion needs a little more than 1."""
 JOINING_SPEED_PART = 0.25
-"""Part of the velocity limits that joining the set points may add to a motion."""
+"""Part of the velocity limits that the transition to the set points may add to their motion."""
 ASTRAY_RAD = 0.005
-"""Distance from the reference beyond which an arm is led back gradually after missed cycles."""
+"""Distance from the reference beyond which an arm is led back smoothly after missed cycles."""
 MAX_AHEAD_S = 2.0
-"""Time ahead at which a set point may be due: beyond that it is a broken command, not a slow
-level."""
+"""Largest time ahead at which a set point may be due. If it is due later, the command is broken."""
 
 
 class SetPoint(NamedTuple):
@@ -37,11 +36,27 @@ class SetPoint(NamedTuple):
 
 
 class Reference:
-    """Interpolates set points: `take` takes them, and tick by tick `at(tick)` gives the motion
-    wanted at that tick.
+    """Interpolates set points.
+
+    `take_command` accepts a set point; `compute_motion` returns the motion wanted at a tick.
+
+    Attributes:
+        speed_scale: Part of full speed for the motion of `move_to` and for joining the set points,
+            up to 1.
+        goal: Goal of `move_to`, (joints,), rad, until another motion begins, else None.
+        holding: No set point is fresh.
+        refused: Number of set points cut at the bounds, and of cycles with one that is NaN or due
+            too far ahead.
     """
 
     def __init__(self, bounds: Bounds, limits: Limits, tick_s: float) -> None:
+        """Start at rest at zero positions.
+
+        Args:
+            bounds: Bounds at which set points are cut.
+            limits: Limits for motions that the reference makes itself.
+            tick_s: Duration of a tick.
+        """
         self._limits = limits
         self._tick_s = tick_s
         self._half_s = 0.5 * tick_s
@@ -49,39 +64,49 @@ class Reference:
         self._fastest = bounds.velocity
         self._hardest = MAX_ACCELERATION * limits.acceleration
         joints = len(limits.velocity)
-        self._motions = np.zeros(
-            (2, 3, joints)
-        )  # the one wanted, and its difference from the curve
+        # The wanted motion, and its difference from the curve.
+        self._motions = np.zeros((2, 3, joints))
         self._wanted = Motion(self._motions[0])
         self._interpolate = set_motion.load()
         self._command: ArmSetPoint | None = None  # the newest `JOINT_SET_POINT`
-        self._offered = 0  # tick at which it is due
+        self._offered = 0  # tick at which that set point is due
         self._due = 0  # tick at which the present curve ends
-        self._next: SetPoint | None = None  # the set point to follow after that
-        self.part = 1.0  # of full speed: of the motion of `to`, and of joining the set points
-        self.goal: Array | None = (
-            None  # (joints,), rad: goal of `to`, until another motion begins; None: none
-        )
-        self.holding = True  # no fresh set point
-        self.refused = (
-            0  # set points cut at the bounds, and cycles that saw one that is NaN or too far ahead
-        )
+        self._next: SetPoint | None = None  # set point to follow after that tick
+        self.part = 1.0
+        self.goal: Array | None = None
+        self.holding = True
+        self.refused = 0
         self.start(np.zeros(joints), np.zeros(joints), 0)
 
     def start(self, position: Array, velocity: Array, tick: int) -> None:
-        """Start from a motion at `tick`, rad, rad/s: ramp to rest and hold."""
+        """Restart from a motion at `tick`: ramp to rest and hold.
+
+        Args:
+            position: (joints,), rad.
+            velocity: (joints,), rad/s.
+            tick: Tick of that motion.
+        """
         self._curve: Curve = Ramp(position, velocity, self._limits.acceleration)
         self._from = tick
         self._difference: Curve | None = None  # from the arm's motion to the curve
         self.goal = None
         self.holding = True
 
-    def meet(self, position: Array, velocity: Array, tick: int, astray: float = ASTRAY_RAD) -> None:
-        """Start from where the arm is after missed cycles, if it has strayed as far as `astray`,
-        rad, and lead it back to the set points.
+    def meet(
+        self, position: Array, velocity: Array, tick: int, tolerance_rad: float = ASTRAY_RAD
+    ) -> None:
+        """After missed cycles, restart from where the arm is, if it has strayed from the motion.
+
+        The arm is then led back to the set points smoothly.
+
+        Args:
+            position: Sensed positions, (joints,), rad.
+            velocity: Sensed velocities, (joints,), rad/s.
+            tick: Tick of the sample.
+            tolerance_rad: Distance from which the arm counts as strayed.
         """
         now = self._motion(tick)
-        if np.max(np.abs(now.position - position)) < astray:
+        if np.max(np.abs(now.position - position)) < tolerance_rad:
             return
         if self.holding or tick >= self._due:
             self.start(position, velocity, tick)
@@ -89,16 +114,15 @@ class Reference:
             self._join(position, velocity, tick)
 
     def take(self, command: ArmSetPoint) -> None:
-        """Take a new `JOINT_SET_POINT`. It must stay the newest message until the next one is
-        taken.
+        """Accept a new `JOINT_SET_POINT`.
+
+        The message must stay the newest one until the next call, because it is copied later.
         """
         self._command = command
         self._offered = command.due
 
     def at(self, tick: int) -> Motion:
-        """Return the motion wanted at `tick`, by the set points taken; its acceleration is
-        mid-cycle.
-        """
+        """Return the motion wanted at `tick`, with the acceleration of the middle of the cycle."""
         if self._next is not None and (self.holding or tick >= self._due):
             self._advance(self._next, tick)
         offered = self._offered
@@ -111,7 +135,7 @@ class Reference:
         return self._motion(tick)
 
     def rest(self, tick: int) -> Motion:
-        """Return the motion wanted at `tick`, ignoring the level above: ramp to rest and hold."""
+        """Return the motion wanted at `tick` when ramping to rest, ignoring the level above."""
         self._next = None
         if not self.holding or self.goal is not None:
             now = self._motion(tick)
@@ -119,10 +143,13 @@ class Reference:
         return self._motion(tick)
 
     def to(self, goal: Array, tick: int) -> Motion:
-        """Return the motion wanted at `tick` on the way to `goal` (joints,), rad, ignoring the
-        level above.
+        """Return the motion wanted at `tick` on the way to a goal, ignoring the level above.
 
-        It ramps to rest, then goes straight, from rest to rest, within the limits of every joint.
+        The motion ramps to rest, then goes straight to the goal within the limits of every joint.
+
+        Args:
+            goal: Position to reach at rest, (joints,), rad; the same array in every cycle.
+            tick: Tick of the motion.
         """
         if self.goal is goal:
             return self._motion(tick)
@@ -139,8 +166,9 @@ class Reference:
         return self._motion(tick)
 
     def _receive(self, due: int, tick: int) -> None:
-        """Copy the set point offered. It waits until the one before it is due: some protocols
-        deliver early.
+        """Copy the set point that was offered.
+
+        It waits until the one before it is due, because some protocols deliver early.
         """
         command = self._command
         if command is None:
@@ -157,9 +185,9 @@ class Reference:
         if self._next is not None and (self.holding or tick >= self._due):
             self._advance(self._next, tick)
 
-    def _advance(self, to: SetPoint, tick: int) -> None:
-        """Begin the curve to the set point that waited: its time has come."""
-        due, position, velocity = to
+    def _advance(self, set_point: SetPoint, tick: int) -> None:
+        """Begin the curve to the waiting set point, once the one before it is due."""
+        due, position, velocity = set_point
         self._next = None
         if due <= tick:
             return
@@ -185,7 +213,13 @@ class Reference:
         self._join(now.position, now.velocity, tick)
 
     def _join(self, position: Array, velocity: Array, tick: int) -> None:
-        """Let the difference between a motion at `tick` and the curve decay."""
+        """Let the difference between a motion at `tick` and the curve decay smoothly.
+
+        Args:
+            position: (joints,), rad.
+            velocity: (joints,), rad/s.
+            tick: Tick of that motion.
+        """
         curve = self._curve.at((tick - self._from) * self._tick_s)
         fastest = JOINING_SPEED_PART * self.part * self._limits.velocity
         self._difference = Decay(
@@ -194,7 +228,10 @@ class Reference:
         self._differs_from = tick
 
     def _motion(self, tick: int) -> Motion:
-        """Return the motion at `tick`, valid until the next call; its acceleration is mid-cycle."""
+        """Return the motion at `tick`, with the acceleration of the middle of the cycle.
+
+        The result is valid until the next call.
+        """
         curve = self._curve
         difference = self._difference
         wanted = self._wanted

@@ -15,7 +15,7 @@ from rack.levels.servo.sensor_monitor import SensorMonitor
 
 
 class Reaction(IntEnum):
-    """Reactions of the servo level; the greater, the stronger."""
+    """Reactions of the servo level, in order of strength."""
 
     NONE = 0  # follow the set points
     HOLD = 1  # ramp to rest, hold with torques
@@ -23,34 +23,45 @@ class Reaction(IntEnum):
     BRAKE = 3  # brake at once
 
 
-DEMANDED = {Demand.NONE: Reaction.NONE, Demand.STOP: Reaction.STOP, Demand.BRAKE: Reaction.BRAKE}
-
-
 class Cause(NamedTuple):
-    """A fault that keeps the arm from its set points."""
+    """A fault that keeps the arm from following its set points."""
 
     error: Error
-    text: str  # the fault, readable
+    text: str  # describes the fault
     joint: int = -1
-    value: float = 0.0  # measured: rad, N m or ticks, by error
-    then: str = ""  # the next step, readable
+    value: float = 0.0  # measured, in rad, N m or ticks, depending on the error
+    then: str = ""  # describes the next step
 
 
 class Stopping:
-    """Weighs the rack's demands, faults of sensors, motors and torques, and blows: the strongest
-    reaction wins.
+    """Weighs demands of the rack, faults and blows; the strongest reaction wins.
 
     A failed motor is retried after a while: the arm holds with it, and follows set points after
-    `good_cycles` without a fault. If it fails while the arm ramps or holds with it, the brakes
-    engage. An arm that was struck, or pressed too hard, stays stopped until nothing has for the
-    same time.
+    `good_cycles` without a fault. If the motor fails again while the arm ramps or holds, the brakes
+    engage. An arm that was struck, or pressed too hard, stays stopped until neither has happened
+    for the same time.
 
     Faults may keep the arm from its set points for `patience`. That time counts up during faults
-    and down while the arm follows, so recurring faults use it up too. Then the fault is latched:
-    the brakes stay engaged.
+    and down while the arm follows, so recurring faults use it up too. Then the fault is latched,
+    and the brakes stay engaged.
+
+    Attributes:
+        refused: Finding about the last cycle's torque or set point, if the arm refused it.
+        error: The latched fault.
+        cause: The fault that keeps the arm from its set points.
+        reason: Why the arm does not follow its set points, in one line, or empty.
+        findings: New findings, one per episode. The reader clears the list.
     """
 
     def __init__(self, params: ArmParams, joints: Sequence[str], tick_s: float, every: int) -> None:
+        """Weigh faults of an arm.
+
+        Args:
+            params: Parameters of the board.
+            joints: Names of the joints.
+            tick_s: Duration of a tick.
+            every: Ticks from cycle to cycle.
+        """
         self._joints = joints
         self._params = params
         self._every = every
@@ -59,24 +70,23 @@ class Stopping:
         self._retry_ticks = round(params.retry / tick_s)
         self._good_ticks = params.good_cycles * every
         self._most = max(round(params.patience / tick_s), every)
-        self.refused: Finding | None = None  # the last cycle's torque, if the arm refused it
-        self.error = Error.NONE  # latched fault
-        self.cause = Error.NONE  # fault that keeps the arm from its set points
-        self.reason = ""  # why the arm does not follow its set points, in one line; empty: it does
-        self.findings: list[Finding] = []  # new ones, one per episode; the reader clears it
+        self.refused: Finding | None = None
+        self.error = Error.NONE
+        self.cause = Error.NONE
+        self.reason = ""
+        self.findings: list[Finding] = []
         self._kept = 0  # ticks for which faults have kept the arm from its set points
-        self._remembered: tuple[int, Error] | None = None  # in the last state
+        self._remembered: tuple[int, Error] | None = None  # values in the last state
         self._tick: int | None = None
-        self._retry_at: int | None = (
-            None  # tick at which a failed motor is retried; None: none has failed
-        )
-        self._on_failure = self._on_motors  # reaction until then
+        # Tick at which a failed motor is retried. None if no motor has failed.
+        self._retry_at: int | None = None
+        self._on_failure = self._on_motors  # reaction until the retry
         self._motor = self._blow = Cause(Error.NONE, "")
         self._struck_until: int | None = None  # tick until which a struck arm stays stopped
-        self._on_blow = Reaction.BRAKE  # reaction until then
+        self._on_blow = Reaction.BRAKE  # reaction until that tick
 
     def recall(self, state: ArmState) -> None:
-        """Continue from the state in an `ARM_STATE`."""
+        """Continue from an `ARM_STATE` after a restart."""
         self._tick = state.tick
         self._kept = state.kept
         if state.error != Error.DISABLED:
@@ -84,7 +94,7 @@ class Stopping:
             self.reason = state.reason
 
     def remember(self, state: ArmState) -> None:
-        """Fill in the state for `recall`."""
+        """Write the state that `restore_state` needs; only when it has changed."""
         error = self.error or (Error.DISABLED if self.is_disabled else Error.NONE)
         if (self._kept, error) != self._remembered:
             self._remembered = self._kept, error
@@ -94,16 +104,25 @@ class Stopping:
 
     @property
     def is_disabled(self) -> bool:
-        """Whether the arm is not enabled, and nothing worse is known."""
+        """True if the arm is not enabled, and no fault has a higher priority."""
         return self.cause in (Error.DISABLED, Error.DRIVES)
 
     @property
     def trying(self) -> bool:
-        """Whether a motor is at fault, or not yet known to be sound again."""
+        """True while a motor is at fault, or has not yet proved to work again."""
         return self._retry_at is not None
 
     def motor_fails(self, joint: int, lacking: float, tick: int) -> Reaction:
-        """Register a motor that lacks `lacking` N m of its torque; return the reaction."""
+        """Register a failed motor.
+
+        Args:
+            joint: Joint of the motor.
+            lacking: Torque that it did not give, N m.
+            tick: Tick of the cycle.
+
+        Returns:
+            The reaction of this cycle.
+        """
         self._on_failure = self._on_motors if self._retry_at is None else Reaction.BRAKE
         self._retry_at = tick + self._retry_ticks
         text = f"motor of '{self._joints[joint]}' does not give the torque commanded"
@@ -114,27 +133,36 @@ class Stopping:
         return self._on_failure
 
     def refuse(self, finding: Finding, tick: int) -> None:
-        """Register a torque that the arm refused."""
+        """Register a torque or set point that the arm refused."""
         self.refused = finding
         self._wait_for(self._about_torque(finding), tick)
 
     def stop_for(
         self, blow: Cause, finding: Finding, tick: int, reaction: Reaction = Reaction.BRAKE
     ) -> None:
-        """Register a blow: a contact that is unintended or too strong, or a joint beyond its limit;
-        with the reaction to it.
+        """Register a contact that is unintended or too strong, or a joint beyond its limit.
+
+        Args:
+            blow: Cause to report.
+            finding: Finding to report, once per episode.
+            tick: Tick of the cycle.
+            reaction: Reaction to it.
         """
         is_new = self._struck_until is None or blow.error is not self._blow.error
-        # The arm may have reported it by itself, in this cycle.
-        if is_new and all(one.alarm is not finding.alarm for one in self.findings):
+        # The arm may have reported it in this cycle already.
+        if is_new and all(known.alarm is not finding.alarm for known in self.findings):
             self.findings.append(finding)
         self._on_blow = reaction if self._struck_until is None else max(self._on_blow, reaction)
         self._struck_until = tick + self._retry_ticks
         self._blow = blow
 
     def wait(self, error: Error, why: str, tick: int) -> Reaction:
-        """Return the reaction of this cycle while the arm is not enabled, which no patience
-        bounds: `error` is DISABLED or DRIVES.
+        """Return the reaction of this cycle while the arm is not enabled, without a time limit.
+
+        Args:
+            error: DISABLED or DRIVES.
+            why: Why the arm is not enabled.
+            tick: Tick of the cycle.
         """
         self._tick = tick
         if not self.error:
@@ -143,15 +171,21 @@ class Stopping:
         return Reaction.BRAKE
 
     def decide(self, demand: Demand, sensors: SensorMonitor, tick: int) -> Reaction:
-        """Return the reaction of this cycle."""
+        """Return the reaction of this cycle while the arm is enabled.
+
+        Args:
+            demand: Stop that the rack demands.
+            sensors: Monitor that has checked the sample of this cycle.
+            tick: Tick of the cycle.
+        """
         passed = tick - self._tick if self._tick is not None else self._every
         self._tick = tick
         if self.is_disabled:
             self.cause = Error.NONE
         if self.error:
             return Reaction.BRAKE
-        sound = self.refused is None and self._retry_at is None and self._struck_until is None
-        if sound and not (sensors.faulty or demand):
+        is_sound = self.refused is None and self._retry_at is None and self._struck_until is None
+        if is_sound and not (sensors.faulty or demand):
             self._kept = max(self._kept - passed, 0) if self._kept else 0
             self.cause = Error.NONE
             self.reason = ""
@@ -177,17 +211,15 @@ class Stopping:
         else:
             self.cause = Error.NONE
             self.reason = ""
-        return max(reaction, DEMANDED[demand]) if demand else reaction
+        return max(reaction, Reaction[demand.name]) if demand else reaction
 
     def _wait_for(self, cause: Cause, tick: int) -> None:
-        """Set `cause` and `reason`: the fault that must end, and the tick at which it is
-        latched.
-        """
+        """Set `cause` and `reason`; the reason names the tick at which the fault is latched."""
         self.cause = cause.error
         self.reason = f"{cause.text}{cause.then}; latched at tick {tick + self._most - self._kept}"
 
     def _weigh(self, sensors: SensorMonitor, tick: int) -> tuple[Reaction, Cause | None]:
-        """Return the reaction to faults, and the fault to report."""
+        """Return the strongest reaction to present faults, and the fault to report."""
         reaction = Reaction.NONE
         cause = None if self.refused is None else self._about_torque(self.refused)
         if sensors.faulty:
@@ -207,20 +239,22 @@ class Stopping:
         return reaction, cause
 
     def _about_sensors(self, sensors: SensorMonitor) -> Cause:
-        joint, read, off = sensors.blamed
+        """Describe the fault of the sensors as the cause of a stop."""
+        joint, read, offset = sensors.blamed
         if joint < 0:
             return Cause(Error.SENSORS, sensors.missing, joint, read)
         text = f"sensor of '{self._joints[joint]}' reads {read:.4g} rad"
-        if off == off:  # known: not NaN
-            text = f"{text}, off by {off:.3g}"
+        if offset == offset:  # NaN if unknown
+            text = f"{text}, off by {offset:.3g}"
         return Cause(Error.SENSORS, text, joint, read)
 
     def _about_torque(self, refused: Finding) -> Cause:
-        what = (
+        """Describe a refused torque or set point as the cause of a stop."""
+        value = (
             "not finite" if refused.alarm is Alarm.COMMAND_INVALID else f"{refused.value:.3g} N m"
         )
-        text = f"rejected: torque of '{self._joints[refused.subject]}' is {what}"
+        text = f"rejected: torque of '{self._joints[refused.subject]}' is {value}"
         if refused.alarm is Alarm.SET_POINT:
-            what = f"{refused.value:.3g} rad from the joint"
-            text = f"rejected: set point of '{self._joints[refused.subject]}' is {what}"
+            value = f"{refused.value:.3g} rad from the joint"
+            text = f"rejected: set point of '{self._joints[refused.subject]}' is {value}"
         return Cause(Error.LIMIT, text, refused.subject, refused.value)

@@ -82,7 +82,7 @@ def goto(rehearsal: Rehearsal, k: int, action: Goto) -> Rehearsal:
     rehearsal.situation.lay_out(motion.checker, None)
     if action.direction == "any":
         place = pose(action.position, pointing(DOWN))
-        anyhow = motion.ik.reachable(place, rehearsal.q, turned=False)
+        anyhow = motion.ik.reachable(place, rehearsal.q, match_orientation=False)
         tools = [motion.ik.tool_at(q) for q in anyhow] or [place]
     elif action.quaternion is not None:
         tools = [pose(action.position, action.quaternion)]
@@ -281,7 +281,7 @@ def _nothing_at(motion: MotionPlanner, tools: list[Pose], here: Array) -> Refuse
             beyond = tool
     end = beyond or tools[0]
     out_of_reach = f"out of reach: {in_metres(end)}; in reach"
-    if motion.ik.reachable(end, here, turned=False):
+    if motion.ik.reachable(end, here, match_orientation=False):
         return Refused(Error.UNREACHABLE, f"{out_of_reach} in another orientation")
     begin = motion.ik.tool_at(here)
     low = 0.0

@@ -187,7 +187,7 @@ MISTAKES = {
             " params={frequency=600.0}}"
         ),
         "board.shoulder.params.modifications.notch",
-        "params.frequency = 600 Hz: permitted: below half the law's rate, 500 Hz",
+        "params.frequency = 600 Hz: must be below half the law's rate, 500 Hz",
     ),
 }
 

@@ -92,8 +92,8 @@ class SharingServoExecutor(ServoExecutor):
         yield from super().misfits(context, above, below)
 
     def process(self, tick: int) -> None:
-        """Do the cycle of a servo level, and write the shared objects when it is due."""
-        if not self._started and self.last.is_there:
+        """Do the cycle of a servo level, and write the shared objects when they are due."""
+        if not self.takeover.is_started and self.last.is_there:
             for body in self._shared.values():
                 body.recall(self.last.message)
         super().process(tick)

@@ -1,6 +1,4 @@
-"""Control of contact forces: the wrist sensor's wrench, hybrid motion/force control, and a server
-of both.
-"""
+"""Control of contact forces: the wrist sensor, hybrid motion/force control, and a server."""
 
 from rack.levels.systems.force.arm_executor import ForceArmExecutor
 from rack.levels.systems.force.client import ForceClient

@@ -1,9 +1,8 @@
-"""The executor of a board of an arm with a wrist sensor: an `ArmExecutor` that measures contacts
-and limits them.
+"""The executor of a board of an arm with a wrist sensor, which measures and limits contacts.
 
-A sample of the sensor is of a contact, of the weight, and of the inertia of all that hangs on the
-flange. The last two follow from the model: it evaluates the same sensor at the same motion, without
-any contact. So no mass is entered twice, and a tool with joints of its own needs no special case.
+A sample of the sensor contains the contact, and the weight and inertia of everything attached to
+the flange. The last two follow from the model: it evaluates the same sensor in the same motion
+without any contact. So no mass is entered twice, and a tool with joints needs no special case.
 """
 
 from __future__ import annotations
@@ -27,37 +26,50 @@ from rack.levels.systems.force.messages import AXES, Wrench
 from rack.levels.systems.joint_boards import ArmExecutor
 
 ALARMS = (Alarm.FORCE_LIMIT, Alarm.MOMENT_LIMIT)
-"""By half of a wrench."""
-
-
+"""Alarms by half of a wrench."""
 BY_AXIS = [0, 3, 1, 4, 2, 5]
-"""Components of a wrench in the order in which their torques are added up."""
+"""Order in which the torques of the components of a wrench are added up."""
 
 
 class ContactWrench:
-    """The wrench of a contact, from samples of the wrist sensor and the motion of the arm."""
+    """The wrench of a contact, from samples of the wrist sensor and the motion of the arm.
+
+    Attributes:
+        raw: Sample in the frame of the sensor, (6,), N, N m.
+        wrench: Wrench of the contact on the tool, at the tool, in the world frame, (6,), N, N m.
+        torque: Torques of the contact on the joints, (joints,), N m.
+        saturated: The sample is at the end of the range or NaN, so the contact may be stronger.
+    """
 
     def __init__(self, cell: Cell, wrist: Wrist, dynamics: Dynamics) -> None:
-        """Use `dynamics` of the cell, the arm's: an evaluation at the same state costs nothing."""
+        """Use the arm's dynamics, which may already be evaluated at the same state.
+
+        Args:
+            cell: Model of the arm.
+            wrist: The wrist sensor.
+            dynamics: Equation of motion of the arm.
+        """
         self._cell = cell
         self._site = wrist.site
         self._dynamics = dynamics
         self._range = np.repeat(wrist.range, 3)
         self._jacobian = np.zeros((AXES, cell.model.nv))
-        # (6,), N, N m: as sensed, in the sensor's frame.
         self.raw = np.zeros(AXES)
-        # (6,), N, N m: of the contact on the tool, at the tool, in the world's frame.
         self.wrench = np.zeros(AXES)
-        self.torque = np.zeros(len(cell.dof))  # (joints,), N m: of the contact on the joints
-        # The sample is at the end of the range, or NaN: the contact may be any stronger.
+        self.torque = np.zeros(len(cell.dof))
         self.saturated = True
 
     def take(self, raw: Array, state: Array, acceleration: Array) -> None:
-        """Take a sample (6,), N, N m, at the state (2, joints), rad, rad/s, and the accelerations
-        (joints,), rad/s2.
+        """Compute the contact from a sample.
+
+        Args:
+            raw: Sample, (6,), N, N m.
+            state: Sensed positions and velocities, (2, joints), rad, rad/s.
+            acceleration: Accelerations, (joints,), rad/s2.
         """
         self.raw[:] = raw
-        self.saturated = not bool((np.abs(raw) < self._range).all())  # written so that NaN counts
+        # Written so that NaN counts as saturated.
+        self.saturated = not bool((np.abs(raw) < self._range).all())
         if not np.isfinite(raw).all():
             return
         self._dynamics.terms(*state)
@@ -66,7 +78,7 @@ class ContactWrench:
         mujoco.mj_rnePostConstraint(model, data)
         body = model.site_bodyid[self._site]
         place = data.site_xpos[self._site]
-        # MuJoCo keeps torque before force, about the centre of the tree that the body belongs to.
+        # MuJoCo stores torque before force, about the centre of mass of the body's tree.
         inner = data.cfrc_int[body]
         expected = np.concatenate((inner[3:], inner[:3]))
         moment = np.zeros(3)
@@ -82,9 +94,7 @@ class ContactWrench:
 
 
 class ForceArmParams(ArmParams):
-    """`[board.<name>.params]`: the arm, and its reactions to faults of sensors and motors and to
-    strong contacts.
-    """
+    """`[board.<name>.params]`: the arm, and its reactions to faults and strong contacts."""
 
     on_force_limit: Reacting = "brake"
     """reaction to a contact beyond the limits: ramp to rest and hold, or ramp and brake, or
@@ -92,19 +102,18 @@ class ForceArmParams(ArmParams):
 
 
 class ForceArmExecutor(WristLevel, ArmExecutor):
-    """Writes the wrench of the contact in every cycle; stops the arm when it is beyond
-    `[robot.wrist]` most_*.
+    """Writes the contact wrench in every cycle, and stops the arm when it is too strong.
 
-    A contact stops the arm for as long as it is too strong and for `retry` longer; after `patience`
-    the fault is latched, as others are. Brakes let the arm spring back a little; an arm that holds
-    keeps pressing. A sensor at the end of its range counts as beyond: what it senses is not known.
-    What a gripper holds counts as contact.
+    The limits are `[robot.wrist]` most_*. A contact beyond them stops the arm while it lasts and
+    for `retry` longer. After `patience` the fault is latched, as other faults are. With brakes the
+    arm springs back a little; an arm that holds keeps pressing. A sensor at the end of its range
+    counts as beyond the limits, because the contact is unknown. A held object counts as contact.
 
-    Weight and inertia of the tool are taken off, by the acceleration that the joints' velocities
-    show or, where encoders are coarse, by that of the set points. At the limits of acceleration a
-    tool of 1.1 kg would otherwise seem to be pushed by 7 N; with the first, at 1 kHz, by 0.2 N,
-    with the second by 2.3 N at most, where dry friction changes sign. (With encoders of 1 mrad that
-    is 2.6 N; their velocities would make 10 N of noise.)
+    Weight and inertia of the tool are subtracted. The acceleration for this comes from the
+    velocities of the joints or, with coarse encoders, from the set points. Without the subtraction,
+    a tool of 1.1 kg at the acceleration limits would show up as 7 N. With velocities, at 1 kHz, 0.2
+    N remain. With set points at most 2.3 N remain, where dry friction changes sign, and 2.6 N with
+    encoders of 1 mrad, whose velocities would cause 10 N of noise.
     """
 
     felt = Input(Wrench, "own.wrench")
@@ -119,20 +128,24 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
         self._on_limit = Reaction[self.settings.on_force_limit.upper()]
         self.contact = ContactWrench(self.cell, self.cell.wrist, self.arm.dynamics)
         self._exact = self.cell.encoders.exact
-        # (joints,), rad/s: velocities at the tick before.
+        # (joints,), rad/s: velocities of the last sample.
         self._before = np.zeros(len(self.cell.dof))
-        self._since: int | None = None  # that tick; None: not known
-        self._exceeded = 0  # cycles in which the contact was beyond the limits
+        self._since: int | None = None  # tick of that sample, None if there is none
+        self._exceeded = 0  # number of cycles in which the contact was beyond the limits
 
     def self_test(self) -> None:
-        """Raise `LevelError` for a class of arms that has no wrist sensor."""
+        """Check that the class of the arm has a wrist sensor.
+
+        Raises:
+            LevelError: It has none.
+        """
         if self.arm.feel() is None:
             raise LevelError(
                 f"params.arm: class '{type(self.arm).__name__}' gives no sample of a wrist sensor"
             )
 
     def process(self, tick: int) -> None:
-        """Advance the arm to `tick`, sense, drive or brake, report."""
+        """Do the cycle of an arm, and write the wrench."""
         if self._since is None and self.felt.is_there:
             self._exceeded = self.felt.message.exceeded
         super().process(tick)
@@ -145,13 +158,13 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
         wrench.sample = contact.raw
 
     def feel(self, tick: int) -> None:
-        """Sense the contact; stop the arm if it is too strong."""
+        """Sense the contact, and stop the arm if it is too strong."""
         raw = self.arm.feel()
         velocity = self._velocity
         assert raw is not None, "the self-test refuses an arm without a sensor"
         acceleration = np.zeros(len(velocity))
-        known = not self.sensors.faulty and (self._exact or not self.abandoned)
-        if known and self._since is not None:
+        is_velocity_known = not self.sensors.faulty and (self._exact or not self.abandoned)
+        if is_velocity_known and self._since is not None:
             acceleration = (velocity - self._before) / (self.context.tick_s * (tick - self._since))
         self.contact.take(raw, self.sensors.state, acceleration)
         self._before[:] = velocity
@@ -160,7 +173,7 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
 
     @property
     def _velocity(self) -> Array:
-        """Velocities whose change is the arm's acceleration, (joints,), rad/s."""
+        """Velocities from whose change the acceleration is computed, (joints,), rad/s."""
         velocity: Array = self.sensors.velocity if self._exact else self._wanted[1]
         return velocity
 
@@ -168,32 +181,30 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
         """Stop the arm if the contact is beyond a limit, or not known to be within it."""
         contact = self.contact
         if contact.saturated:
-            found = Finding(Alarm.FORCE_LIMIT, -1, norm(contact.raw[:3]))
-            self._stop(
-                found, "contact too strong: the wrist sensor is at the end of its range", tick
-            )
+            finding = Finding(Alarm.FORCE_LIMIT, -1, norm(contact.raw[:3]))
+            text = "contact too strong: the wrist sensor is at the end of its range"
+            self._stop(finding, text, tick)
             return
-        for (half, what, unit), most, alarm in zip(HALVES, self._most, ALARMS, strict=True):
+        for (half, name, unit), limit, alarm in zip(HALVES, self._most, ALARMS, strict=True):
             strength = norm(contact.wrench[half])
-            if strength > most:
-                text = f"contact too strong: {what} of {strength:.3g} {unit}; permitted: {most:g}"
+            if strength > limit:
+                text = f"contact too strong: {name} of {strength:.3g} {unit}; permitted: {limit:g}"
                 self._stop(Finding(alarm, -1, strength), text, tick)
                 return
 
-    def _stop(self, found: Finding, text: str, tick: int) -> None:
+    def _stop(self, finding: Finding, text: str, tick: int) -> None:
+        """Count the cycle, and register the contact as the cause of a stop."""
         self._exceeded += 1
-        cause = Cause(Error.FORCE, text, value=found.value)
-        self.stopping.stop_for(cause, found, tick, self._on_limit)
+        cause = Cause(Error.FORCE, text, value=finding.value)
+        self.stopping.stop_for(cause, finding, tick, self._on_limit)
 
     def started(self) -> None:
-        """Continue from the state that was restored."""
+        """Continue from the restored state."""
         self._before[:] = self._velocity
         self._since = self.arm.tick
 
     def find_terms(self) -> Terms:
-        """Return the equation of motion at the sensed state, with what the gripper holds, and with
-        the contact.
-        """
+        """Return the equation of motion at the sensed state, with payload and contact."""
         terms = super().find_terms()
         terms.bias[:] -= self.contact.torque
         return terms

@@ -1,16 +1,17 @@
-"""A client of a server of force and motion, on the host side: its calls, besides those of
-`Motions`, and its part of `[task]`, task frames and contacts by name, checked before the launch.
+"""A client of a server of force and motion, on the host side.
 
-    comply("wipe")                what follows is done with the axes of force of [task.contact.wipe]
+It offers these calls in addition to the calls of `Motions`. Task frames and contacts have names in
+`[task]`, which is checked before the launch.
+
+    comply("wipe")                 later motions have the axes of force of [task.contact.wipe]
     comply("wipe", wrench={"z": 20.0})       the same with another force
-    guard("touch")                the next of its wrenches ends the motion under way
-    free()                        motion alone, without guards
-    wrench(), mode()              of the tool on the surroundings, N, N m, by axis; what the
-                                  server does
+    guard("touch")                 the next of its wrenches ends the motion under way
+    free()                         motion alone, without guards
+    wrench(), mode()               wrench of the tool, N, N m, by axis; mode of the server
 
-A guard that ends a request ends itself with it: `end_of(request)` is GUARDED. Calls that wait give
-the server its sign of life; a program that makes none for longer than the server's `silence` is
-lost to it.
+A guard that ends a request is used up: `end_of(request)` is GUARDED. Calls that wait give the
+server its sign of life. A program that makes no call for longer than `silence` is lost to the
+server.
 """
 
 from __future__ import annotations
@@ -35,13 +36,11 @@ from rack.levels.tables import Finite, Positive, RobotConfig, SceneConfig, Table
 SIGN_S = 0.1
 """Simulated time between signs of life."""
 MAX_COSINE = 1e-3
-"""Axes that are closer to a right angle than this span a frame."""
+"""Largest cosine of the angle between two axes that counts as a right angle."""
 
 
 class FrameConfig(Table):
-    """`[task.frame.<name>]`: a task frame by two of its axes, in the world's frame, of any
-    length.
-    """
+    """`[task.frame.<name>]`: a task frame by two of its axes, in the world frame, of any length."""
 
     x: Vector
     """its x axis"""
@@ -49,7 +48,7 @@ class FrameConfig(Table):
     """its z axis, at a right angle to x"""
 
     def objection(self) -> str:
-        """Return why the axes are no frame; empty: they are one."""
+        """Return why the axes do not define a frame, or an empty text."""
         lengths = norm(self.x) * norm(self.z)
         if not lengths > 0.0:
             return "an axis of length 0: no frame"
@@ -69,18 +68,19 @@ class FrameConfig(Table):
 
 
 class ContactConfig(Table):
-    """`[task.contact.<name>]`: a contact for the calls `comply` and `guard`; axes that are not
-    named are of motion.
+    """`[task.contact.<name>]`: a contact for the calls `comply` and `guard`.
+
+    Axes without a wrench are axes of motion.
     """
 
     frame: str
     """task frame"""
     wrench: dict[Axis, Finite] = {}
-    """of the tool on the surroundings on axes of force, N or N m; by axis"""
+    """wrench of the tool on the surroundings on axes of force, N or N m; by axis"""
     speed: dict[Axis, Positive] = {}
-    """most on an axis of force, m/s or rad/s; by axis; default: the server's"""
+    """largest velocity on axes of force, m/s or rad/s; by axis; default: the server's"""
     guard: dict[Axis, Positive] = {}
-    """wrench, either way, that ends a motion, N or N m; by axis"""
+    """wrench, in either direction, that ends a motion, N or N m; by axis"""
 
 
 class ForceProgram(Program):
@@ -92,9 +92,7 @@ class ForceProgram(Program):
     """contacts, by name"""
 
     def misfits(self, robot: RobotConfig | None, scene: SceneConfig) -> Misfits:
-        """Yield frames that are none, and contacts in no frame, or beyond the limits of arm and
-        sensor.
-        """
+        """Yield invalid frames, and contacts in unknown frames or beyond the limits of the arm."""
         bent = {name: reason for name, frame in self.frame.items() if (reason := frame.objection())}
         for name, reason in bent.items():
             yield f"frame.{name}", self.frame[name].model_dump(), reason
@@ -103,10 +101,10 @@ class ForceProgram(Program):
                 yield f"contact.{name}", contact.model_dump(exclude_defaults=True), reason
 
     def objection(self, contact: ContactConfig, robot: RobotConfig | None) -> str:
-        """Return why a contact is impossible; empty: it is not."""
+        """Return why a contact is impossible, or an empty text."""
         if contact.frame not in self.frame:
             return (
-                f"frame '{contact.frame}' is not in [task.frame]; permitted:"
+                f"frame '{contact.frame}' is not in [task.frame]; valid values:"
                 f" {', '.join(self.frame) or 'none'}"
             )
         if robot is None or robot.wrist is None:
@@ -135,13 +133,14 @@ class ForceProgram(Program):
 
 
 def by_axis(values: Mapping[Axis, float]) -> Array:
-    """Return values by axis as a vector, (6,); 0 for axes that are not named."""
+    """Return values by axis as a vector, (6,), with 0 for axes without a value."""
     return np.array([values.get(name, 0.0) for name in AXIS_NAMES])
 
 
 class ForceMotions(Motions):
-    """Requests for forces and motions as calls. A call raises `LevelError` at once for a contact
-    that is impossible.
+    """Requests for forces and motions as calls.
+
+    A call raises `LevelError` at once for a contact that is impossible.
     """
 
     def __init__(
@@ -158,7 +157,10 @@ class ForceMotions(Motions):
         super().__init__(bus, motion, requests, context)
 
     def comply(self, contact: str, **changes: Any) -> int:
-        """Make axes ones of force, at rest; done when their forces are as wanted."""
+        """Make axes of a contact axes of force, once the arm rests.
+
+        The request is done when the forces are as wanted. Keywords change entries of the contact.
+        """
         wanted = self._wanted("comply", contact, changes)
         if not wanted.selected.any():
             raise LevelError(
@@ -169,19 +171,22 @@ class ForceMotions(Motions):
         return self._request(kind=MotionKind.COMPLY, **fields)
 
     def guard(self, contact: str, **changes: Any) -> int:
-        """Guard axes: the next wrench beyond a limit ends the motion under way."""
+        """Guard axes: the next wrench beyond a limit ends the motion under way.
+
+        Keywords change entries of the contact.
+        """
         wanted = self._wanted("guard", contact, changes)
         if not wanted.guard.any():
             raise LevelError(f"guard: contact '{contact}' guards no axis")
         return self._request(kind=MotionKind.GUARD, frame=wanted.frame, guard=wanted.guard)
 
     def free(self) -> int:
-        """End compliance and guards; done when the arm rests where it is."""
+        """End compliance and guards. The request is done when the arm rests where it is."""
         return self._request(kind=MotionKind.COMPLY)
 
     @property
     def _status(self) -> ServerStatus:
-        """The newest status of the server."""
+        """Newest status of the server."""
         return self._server.read().message
 
     def wrench(self) -> Mapping[str, float]:
@@ -192,26 +197,35 @@ class ForceMotions(Motions):
         }
 
     def mode(self) -> Mode:
-        """Return what the server does."""
+        """Return the mode of the server."""
         return Mode(self._status.mode)
 
     def where(self) -> list[float]:
-        """Return the tool position as sensed, m."""
+        """Return the sensed position of the tool, m."""
         return [round(float(x), 4) for x in self._status.place]
 
     def _wanted(self, call: str, name: str, changes: Mapping[str, Any]) -> Wanted:
-        """Return a contact of the program, with changes. Raises `LevelError`."""
+        """Return a contact of the program with changes.
+
+        Args:
+            call: Name of the call, for messages.
+            name: Name of the contact.
+            changes: Entries of the contact to replace.
+
+        Raises:
+            LevelError: There is no such contact, or it is impossible.
+        """
         contact = self._program.contact.get(name)
         if contact is None:
             known = ", ".join(self._program.contact) or "none"
             raise LevelError(
-                f"{call}: contact '{name}' is not in [task.contact]; permitted: {known}"
+                f"{call}: contact '{name}' is not in [task.contact]; valid values: {known}"
             )
         try:
             changed = ContactConfig(**{**contact.model_dump(), **changes})
         except ValidationError as error:
             first = error.errors()[0]
-            key = ".".join(str(part) for part in first["loc"])
+            key = ".".join(map(str, first["loc"]))
             raise LevelError(
                 f"{call}: {key} = {first['input']!r}: {first['msg'].lower()}"
             ) from error
@@ -220,6 +234,7 @@ class ForceMotions(Motions):
         return self._program.wanted(changed)
 
     def _look(self) -> None:
+        """Send a sign of life if one is due, besides what the base class does."""
         if self._bus.tick - self._signed >= self._sign_ticks:
             self._signed = self._bus.tick
             self._send({"id": 0})
@@ -234,5 +249,5 @@ class ForceClient(CommandEnvironment):
     program = ForceProgram
 
     def motions(self, bus: Bus) -> Motions:
-        """Return what makes requests of calls."""
+        """Return the object that turns calls into requests."""
         return ForceMotions(bus, self.motion, self.requests, self.context)

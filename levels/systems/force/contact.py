@@ -1,5 +1,6 @@
-"""The contact that requests have asked for: which axes of a task frame are of force, and what ends
-a motion; and the base of the levels that need a wrist sensor for it.
+"""The contact that requests have asked for, and the base of levels that need a wrist sensor.
+
+A contact determines which axes of a task frame are axes of force, and which wrenches end a motion.
 """
 
 from __future__ import annotations
@@ -15,18 +16,21 @@ from rack.levels.systems.force.messages import AXES, Compliance
 
 Axis = Literal["x", "y", "z", "rx", "ry", "rz"]
 AXIS_NAMES: tuple[Axis, ...] = get_args(Axis)
-"""Axes of a task frame: along x, y, z, then about them."""
+"""Names of the axes of a task frame: along x, y, z, then about them."""
 UNITS = ("N", "N", "N", "N m", "N m", "N m")
 HALVES = ((slice(0, 3), "force", "N"), (slice(3, 6), "torque", "N m"))
-"""The halves of a wrench."""
+"""The halves of a wrench: slice, name and unit."""
 MAX_UNIT_ERROR = 1e-3
-"""A quaternion whose length is farther from 1 is no orientation."""
+"""Largest permitted deviation of the length of a quaternion from 1."""
 SAME = 1e-9
-"""Largest difference between the numbers of quaternions that are the same."""
+"""Largest difference between quaternions that count as the same."""
 
 
 class Wanted(NamedTuple):
-    """What a request asks of a contact; the last four (6,), by axis. See `ServerRequest`."""
+    """The contact that a request asks for. The last four are (6,), by axis.
+
+    See `ServerRequest`.
+    """
 
     frame: Array  # (4,)
     selected: Mask
@@ -36,61 +40,72 @@ class Wanted(NamedTuple):
 
     @classmethod
     def of(cls, record: Any) -> Self:
-        """Return that of the record of a request."""
+        """Return the contact of the record of a request."""
         wanted = cls(*(record[name] for name in cls._fields))
         return wanted._replace(selected=wanted.selected.astype(bool))
 
 
 class Contact:
-    """What is in force: the content of a server's `Compliance`."""
+    """The contact in force: the content of a server's `Compliance`.
+
+    Attributes:
+        id: Number that rises with every change.
+        frame: Orientation of the task frame, as w, x, y, z.
+        selected: Axes of force.
+        wrench: Wanted wrench of the tool, N, N m.
+        speed: Largest velocity on axes of force, m/s, rad/s.
+        guard: Wrench that ends a motion, N, N m, or 0.
+    """
 
     def __init__(self) -> None:
-        self.id = 0  # rises with every change
-        self.frame = np.array([1.0, 0.0, 0.0, 0.0])  # orientation of the task frame
-        self.selected = np.zeros(AXES, dtype=bool)  # axes of force
-        self.wrench, self.speed, self.guard = np.zeros((3, AXES))  # N, N m; m/s, rad/s; N, N m
+        self.id = 0
+        self.frame = np.array([1.0, 0.0, 0.0, 0.0])
+        self.selected = np.zeros(AXES, dtype=bool)
+        self.wrench, self.speed, self.guard = np.zeros((3, AXES))
 
     @property
     def complies(self) -> bool:
-        """Whether any axis is one of force."""
+        """True if any axis is an axis of force."""
         return bool(self.selected.any())
 
     def comply(self, wanted: Wanted) -> bool:
-        """Replace the axes of force, and the guards if the frame is another; return whether motion
-        begins anew.
+        """Replace the axes of force, and drop the guards if the frame is another one.
+
+        Returns:
+            True if the motion must restart from rest.
         """
         selected = wanted.selected
-        turned = not self._is_frame(wanted.frame)
-        begins_anew = self.complies and (turned or bool((self.selected != selected).any()))
-        if turned:
+        is_other_frame = not self._is_frame(wanted.frame)
+        must_restart = self.complies and (is_other_frame or bool((self.selected != selected).any()))
+        if is_other_frame:
             self.guard[:] = 0.0
         self.id += 1
         self.frame[:] = wanted.frame / norm(wanted.frame)
         self.selected[:] = selected
         self.speed[:] = wanted.speed
         self.wrench[:] = np.where(selected, wanted.wrench, 0.0)
-        return begins_anew
+        return must_restart
 
     def watch(self, frame: Array, guard: Array) -> None:
-        """Replace the guards."""
+        """Replace the task frame and the guards."""
         self.id += 1
         self.frame[:] = frame / norm(frame)
         self.guard[:] = guard
 
     def relax(self) -> None:
-        """Want no force on the axes of force."""
+        """Set the wanted forces to zero; the axes of force remain."""
         self.id += 1
         self.wrench[:] = 0.0
 
     def release(self) -> None:
-        """Make all axes ones of motion, unguarded."""
+        """Make all axes axes of motion without guards."""
         self.id += 1
         self.selected[:] = False
         self.wrench[:] = 0.0
         self.guard[:] = 0.0
 
     def objection(self, frame: Array, guard: Array) -> str:
-        """Return why guards in that frame are impossible now; empty: they are not."""
+        """Return why guards in a frame are impossible at present, or an empty text."""
         if self.complies and guard.any() and not self._is_frame(frame):
             return (
                 "the guard's frame is not that of the axes of force; permitted while complying: the"
@@ -99,50 +114,52 @@ class Contact:
         return ""
 
     def _is_frame(self, frame: Array) -> bool:
-        # q and -q are the same orientation.
+        """Return True if `frame` is the present task frame; q and -q are the same orientation."""
         return bool(1.0 - abs(float((frame * self.frame).sum())) / norm(frame) < SAME)
 
     def fill(self, compliance: Compliance) -> None:
-        """Fill a `Compliance`."""
+        """Write the contact to a `Compliance`."""
         compliance.id = self.id
         compliance.active = self.complies or bool(self.guard.any())
         for name in Wanted._fields:
             setattr(compliance, name, getattr(self, name))
 
     def recall(self, compliance: Compliance) -> None:
-        """Continue from the last message of a level that was restarted."""
+        """Continue from the last message after a restart."""
         self.id = compliance.id
         for name in Wanted._fields:
             getattr(self, name)[:] = getattr(compliance, name)
 
 
 def misfit(frame: Array, vectors: Sequence[Array], most: tuple[float, float]) -> str:
-    """Return why a task frame (4,), or wrenches (6,) in it, are impossible; `most`: of a contact, N
-    and N m.
+    """Return why a task frame, or a wrench in it, is impossible, or an empty text.
 
-    Empty: they are possible.
+    Args:
+        frame: Orientation of the frame, as w, x, y, z.
+        vectors: Wrenches, (6,) each.
+        most: Largest force, N, and torque, N m, of a contact.
     """
-    # Written so that NaN is outside.
+    # Written so that NaN is rejected.
     if not abs(norm(frame) - 1.0) <= MAX_UNIT_ERROR:
         return f"the task frame's quaternion has length {norm(frame):.3g}; permitted: 1"
     for wrench in vectors:
-        for (half, what, unit), limit in zip(HALVES, most, strict=True):
+        for (half, name, unit), limit in zip(HALVES, most, strict=True):
             if not norm(wrench[half]) <= limit:
                 return (
-                    f"{what} {norm(wrench[half]):g} {unit}; permitted by the arm and its sensor:"
+                    f"{name} {norm(wrench[half]):g} {unit}; permitted by the arm and its sensor:"
                     f" {limit:g}"
                 )
     return ""
 
 
 class WristLevel(Executor):
-    """An executor for arms with a wrist sensor."""
+    """Base of executors for arms with a wrist sensor."""
 
     @classmethod
     def misfits(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Misfits:
-        """Yield an arm without a wrist sensor, besides what any level of the kind finds."""
+        """Yield an arm without a wrist sensor, and what the base class yields."""
         yield from super().misfits(context, above, below)
         if context.robot.wrist is None:
             yield (

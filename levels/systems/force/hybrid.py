@@ -1,5 +1,6 @@
-"""The executor of a level of hybrid motion/force control, between a trajectory level and boards
-that servo joints.
+"""The executor of a level of hybrid motion/force control.
+
+It stands between a trajectory level and boards that servo joints.
 """
 
 from __future__ import annotations
@@ -21,34 +22,45 @@ from rack.levels.systems.force.hybrid_law import ForceTask, HybridGains, HybridL
 from rack.levels.systems.force.messages import AXES, Compliance, ForceStatus, Wrench
 from rack.levels.systems.joint_boards.messages import JointReference, JointStatus
 from rack.levels.systems.trajectory.boards import JointBoards
-from rack.levels.tables import read_params
 
 LEAD_CYCLES = 2
-"""Cycles from the release that makes a reference to the tick at which it is due: the boards below
-need it in time."""
+"""Cycles from the release that computes a reference to the tick at which it is due, so that the
+boards below have it in time."""
 PASSED = ("opening", "force", "payload_mass", "payload_offset", "operator")
-"""Fields of a reference that are handed on as they are."""
+"""Fields of a reference that are passed down unchanged."""
 OLDEST_CYCLES = 2
 """Cycles of the level after which a wrench is too old."""
+NO_FORCE = np.zeros((2, AXES))
+"""Wanted wrench and selected axes without axes of force."""
 
 
 class ComplianceWatch:
-    """The command in force, judged against the newest wrench in every cycle."""
+    """Judges the command in force against the newest wrench in every cycle.
+
+    Attributes:
+        task: Axes of force, or None if there are none.
+        struck: Id of the newest command whose guard was struck.
+        axis: Axis of that guard, or -1.
+        sensed: Tick of the newest wrench, or -1.
+        felt: Wrench of the contact on the tool, in the task frame, (6,), N, N m.
+        rests: The motion must end.
+        reason: Why the motion must end, or why the applied force is not the wanted one. Else empty.
+    """
 
     def __init__(self, most: tuple[float, float], every: int) -> None:
-        """`most`: of a contact, N and N m; `every`: ticks of a cycle."""
+        """Limit contacts to `most`, N and N m. A cycle takes `every` ticks."""
         self._most = most
         self._oldest = OLDEST_CYCLES * every
-        self.task: ForceTask | None = None  # axes of force; None: there are none
-        self.struck = 0  # id of the newest command whose guard was struck
-        self.axis = -1  # of that guard
-        self.sensed = -1  # tick of the newest wrench; -1: none yet
-        self.felt = np.zeros(AXES)  # (6,), N, N m: of the contact on the tool, in the task frame
-        self.rests = False  # the motion must end
-        self.reason = ""  # why, or why the force wanted is another; empty: all is as commanded
+        self.task: ForceTask | None = None
+        self.struck = 0
+        self.axis = -1
+        self.sensed = -1
+        self.felt = np.zeros(AXES)
+        self.rests = False
+        self.reason = ""
 
     def recall(self, last: Reading[ForceStatus]) -> None:
-        """Continue after a restart from the last `ForceStatus`: a guard strikes once."""
+        """Continue after a restart from the last `ForceStatus`, because a guard acts only once."""
         if last.is_there:
             self.struck = last.message.struck
             self.axis = last.message.axis
@@ -60,7 +72,14 @@ class ComplianceWatch:
         above_is_lost: bool,
         tick: int,
     ) -> None:
-        """Judge the commands and the wrench of this cycle."""
+        """Judge command and wrench of one cycle.
+
+        Args:
+            compliance: Command and its verdict.
+            wrench: Wrench and its verdict.
+            above_is_lost: The level above is lost.
+            tick: Tick of the cycle.
+        """
         wanted = compliance.message
         self.task = None
         self.rests = False
@@ -72,7 +91,7 @@ class ComplianceWatch:
         if reason:
             self._rest(reason)
         elif wanted.active:
-            # Do what the command says, as far as the contact is known and the level above is there.
+            # Rest if the contact is not known or a level above is lost.
             blind = self._blind(wrench, tick)
             if blind or above_is_lost or compliance.is_lost:
                 self._rest(blind or ABOVE_LOST)
@@ -81,11 +100,12 @@ class ComplianceWatch:
                 self._guard(wanted)
 
     def _rest(self, reason: str) -> None:
+        """Require that the motion ends."""
         self.rests = True
         self.reason = reason
 
     def _blind(self, wrench: Reading[Wrench], tick: int) -> str:
-        """Return why the contact is not known; empty: it is."""
+        """Return why the contact is not known, or an empty text."""
         if not wrench.is_there or wrench.is_lost:
             return "no wrench from the board of the arm: waiting for it"
         if tick - self.sensed > self._oldest:
@@ -93,7 +113,7 @@ class ComplianceWatch:
         return "the wrist sensor is at the end of its range" if wrench.message.saturated else ""
 
     def _take(self, compliance: Compliance, rotation: Array) -> None:
-        """Take over the axes of force; those forces are not sought while the motion must end."""
+        """Set the axes of force. While the motion must end, they rest."""
         selected = compliance.selected.astype(bool)
         if selected.any():
             wanted = self._permitted(np.where(selected, compliance.wrench, 0.0))
@@ -101,20 +121,20 @@ class ComplianceWatch:
             self.task = ForceTask(rotation, selected, wanted, exerted, compliance.speed)
 
     def _permitted(self, wanted: Array) -> Array:
-        """Return the force wanted, within the limits of the arm on contacts."""
-        for (half, what, unit), most in zip(HALVES, self._most, strict=True):
+        """Return the wanted wrench, reduced to the arm's limits on contacts."""
+        for (half, name, unit), limit in zip(HALVES, self._most, strict=True):
             size = norm(wanted[half])
-            if size > most:
-                wanted[half] *= most / size
+            if size > limit:
+                wanted[half] *= limit / size
                 text = (
-                    f"{what} of {size:.3g} {unit} is wanted, {most:g} applied: the arm's limit on"
+                    f"{name} of {size:.3g} {unit} is wanted, {limit:g} applied: the arm's limit on"
                     " contacts"
                 )
                 self.reason = self.reason or text
         return wanted
 
     def _guard(self, compliance: Compliance) -> None:
-        """End the motion once for a command whose guard is struck."""
+        """End the motion if a guard is struck, once for each command."""
         beyond: Mask = (compliance.guard > 0.0) & (np.abs(self.felt) > compliance.guard)
         if beyond.any() and self.struck != compliance.id:
             self.struck = compliance.id
@@ -126,7 +146,7 @@ class ComplianceWatch:
 
 
 def objection(compliance: Compliance) -> str:
-    """Return why a command is impossible; empty: it is not."""
+    """Return why a command is impossible, or an empty text."""
     numbers = np.concatenate(
         (compliance.frame, compliance.wrench, compliance.speed, compliance.guard)
     )
@@ -139,7 +159,7 @@ def objection(compliance: Compliance) -> str:
 
 
 def rotation_of(quaternion: Array) -> Array:
-    """Return the rotation matrix (3, 3) of a quaternion of any length but 0."""
+    """Return the rotation matrix, (3, 3), of a quaternion of any length but 0."""
     unit = quaternion.copy()
     rotation = np.zeros(9)
     mujoco.mju_normalize4(unit)
@@ -148,16 +168,15 @@ def rotation_of(quaternion: Array) -> Array:
 
 
 class HybridExecutor(WristLevel):
-    """Hands the references of the level above on, later by `LEAD_CYCLES`; on axes of force it moves
-    for the force.
+    """Passes the references of the level above down, and adds motion for forces.
 
-    A guard that is struck ends the motion: the arm ramps to rest and holds until the level above
-    has another command; axes of force keep their forces. Without a fresh wrench, or while the level
-    above is lost, all axes rest.
+    References become due `LEAD_CYCLES` later. A guard that is struck ends the motion: the arm ramps
+    to rest and holds until the level above has another command, while axes of force keep their
+    forces. Without a fresh wrench, or while the level above is lost, all axes rest.
 
-    References after that, after the brakes, and after a restart of this board, begin where `status`
-    says that the arm is held. References that go on when axes cease to be of force are followed at
-    the distance that force has left.
+    After that, after braking, and after a restart of this board, references must begin where
+    `status` reports that the arm is held. When axes cease to be axes of force during a motion, the
+    references are followed with the difference that force control has left.
     """
 
     above = Input(JointReference, "above.command")
@@ -169,6 +188,7 @@ class HybridExecutor(WristLevel):
     status = Output(JointStatus, rests_on=statuses)
     force = Output(ForceStatus, rests_on=wrench)
     params = HybridGains
+    settings: HybridGains
     preloads = (curves, dynamics, reference)
 
     def __init__(self, context: LevelContext) -> None:
@@ -176,17 +196,17 @@ class HybridExecutor(WristLevel):
         cell = cell_of(context)
         assert cell.wrist is not None, "`misfits` refuses an arm without a sensor"
         self._watch = ComplianceWatch(cell.wrist.most, context.every)
-        self._law = HybridLaw(cell, read_params(HybridGains, context.params))
+        self._law = HybridLaw(cell, self.settings)
         self._reference = Reference(cell.bounds, cell.limits, context.tick_s)
         self._boards = JointBoards(context.robot.joints, cell.bounds.position)
-        self._target: Array = cell.home.copy()  # (joints,), rad: commanded last
-        # (joints,), rad/s: of the motion alone, without that for forces.
+        self._target: Array = cell.home.copy()  # (joints,), rad: last position commanded
+        # (joints,), rad/s: velocity of the motion, without the part for forces.
         self._moving = np.zeros(len(cell.home))
         self._still = np.zeros(len(cell.home))
-        self._tick: int | None = None  # of the last cycle
+        self._tick: int | None = None  # tick of the last cycle
 
     def process(self, tick: int) -> None:
-        """Follow references and forces; report."""
+        """Do one cycle: follow references and forces, and report."""
         if self._tick is None:
             self._watch.recall(self.last_force)
             self._tick = tick - self.context.every
@@ -215,20 +235,20 @@ class HybridExecutor(WristLevel):
         force.offset = self._law.offset
         force.struck = watch.struck
         force.axis = watch.axis
-        force.wanted = np.zeros(AXES) if watch.task is None else watch.task.wanted
-        force.selected = np.zeros(AXES) if watch.task is None else watch.task.selected
-        resting = State.IDLE if watch.task is None else State.EXECUTING
+        task = watch.task
+        force.wanted, force.selected = (task.wanted, task.selected) if task else NO_FORCE
+        resting = State.EXECUTING if task else State.IDLE
         force.state = State.HOLDING if watch.reason else resting
         force.reason = watch.reason
 
     def _begin(self, position: Array, tick: int) -> None:
-        """Begin at rest, without a difference from the motion."""
+        """Start at rest at `position`, without a difference from the motion."""
         self._law.begin()
         self._target = position.copy()
         self._reference.start(position, self._still, tick)
 
     def _move(self, command: JointReference, tick: int, passed_s: float) -> None:
-        """Write the reference of two cycles later."""
+        """Write the reference that is due two cycles later."""
         watch = self._watch
         reference = self._reference
         motion = reference.rest(tick) if watch.rests else reference.at(tick)
@@ -243,7 +263,7 @@ class HybridExecutor(WristLevel):
             self._begin(self._target, tick)
 
     def _report(self, status: JointStatus) -> None:
-        """Show the boards below as one, whose set points are those of this level."""
+        """Report the boards below as one, with this level's set points."""
         values = [reading.message for reading in self.statuses.values()]
         status.position = values[0].position
         status.torque[:] = sum(v.torque for v in values)
@@ -256,12 +276,12 @@ class HybridExecutor(WristLevel):
         status.stopped = not self._boards.in_step
         status.due = self.above.message.due
         worst = max(values, key=lambda value: value.error)
-        kept = self._watch.reason if self._boards.in_step else self._boards.awaited
+        waiting = self._watch.reason if self._boards.in_step else self._boards.awaited
         status.error = worst.error
-        status.reason = worst.reason if worst.error else kept
+        status.reason = worst.reason if worst.error else waiting
         if worst.error:
             status.state = State.ERROR
-        elif kept:
+        elif waiting:
             status.state = State.HOLDING
         else:
             status.state = State.IDLE if self._reference.holding else State.EXECUTING

@@ -1,14 +1,13 @@
-"""The law of hybrid motion/force control: where the joints are to be, some axes of a task frame
-being of force.
+"""The law of hybrid motion/force control for the joints of an arm.
 
-On axes of motion the tool follows the level above; on axes of force it moves with a velocity
-proportional to the error of the force (Raibert and Craig, "Hybrid position/force control of
-manipulators", 1981, split the axes so; the velocity in place of their torque is what suits joints
-that are servoed in position). The force wanted is fed forward as J^T F.
+On axes of motion the tool follows the level above. On axes of force it moves with a velocity
+proportional to the force error. Raibert and Craig ("Hybrid position/force control of manipulators",
+1981) split the axes in this way; they command torques, but velocities suit joints with position
+servos. The wanted force is fed forward as J^T F.
 
-The law works on the difference between what it commands and what the level above wants, dq in joint
-space: with no axis of force the difference stays what it is, so the motion goes on without a step,
-only elsewhere.
+The law works with the difference dq between its joint positions and the level above's.
+When no axis is of force, dq stays constant, so the motion continues without a step at another
+place.
 """
 
 from __future__ import annotations
@@ -28,56 +27,57 @@ from rack.levels.systems.force.messages import AXES
 from rack.levels.tables import Positive, Table
 
 DAMPING = 1e-4
-"""Added to J J^T, m2 and 1: a direction in which the arm hardly moves, by less than 0.01 m/s at 1
-rad/s, gets less of what is wanted, and no joint is asked for more than 50 rad/s for 1 m/s.
-Elsewhere 0.25 % is missing."""
+"""Added to J J^T, m2 and 1. It reduces the velocity in directions in which the arm hardly moves,
+less than 0.01 m/s at 1 rad/s, so that no joint is asked for more than 50 rad/s for 1 m/s. In other
+directions it costs 0.25 %."""
 CATCH_UP = 20.0
-"""Pace at which an error on an axis of motion is made up, 1/s: it comes from damping and limits
-alone."""
+"""Rate at which an error on an axis of motion is corrected, 1/s. Only damping and limits cause such
+errors."""
 
 
 class HybridGains(Table):
-    """Gains of the loop around the contact.
+    """Gains of the force loop.
 
-    The velocity on an axis of force is `bandwidth` / `stiffness` times the error of the force,
-    smoothed: against a contact of that stiffness the error falls by e in 1 / `bandwidth`. Smoothing
-    is needed because boards that servo joints feed dry friction forward by the sign of a velocity:
-    unsmoothed, at 200 Hz, the PUMA's tool shakes by 14 N.
+    The velocity on an axis of force is `bandwidth` / `stiffness` times the force error, smoothed.
+    In a contact of that stiffness the error falls by a factor of e in 1 / `bandwidth`. Smoothing is
+    needed because boards that servo joints feed dry friction forward by the sign of a velocity.
+    Without it, the tool of the PUMA shakes by 14 N at 200 Hz.
 
     Measured with the PUMA and a pad of 16 N/mm, at 200 Hz over 1 kHz: 20 N are reached without
     overshoot, within 5 % 0.2 s after the first contact, and kept within 2 N while the tool slides
-    at 0.1 m/s; a loop 4 times as fast is as good, one 6 times as fast shakes while it slides.
+    at 0.1 m/s. A loop that is 4 times as fast works as well; one that is 6 times as fast shakes
+    while the tool slides.
     """
 
     stiffness: Positive = 10_000.0
-    """of the stiffest contact, tool included, N/m"""
+    """stiffness of the stiffest contact, tool included, N/m"""
     turning_stiffness: Positive = 40.0
-    """the same about an axis, N m/rad"""
+    """stiffness of the stiffest contact about an axis, N m/rad"""
     bandwidth: Positive = Field(10.0, le=100.0)
-    """of the force loop against that contact, rad/s"""
+    """bandwidth of the force loop in that contact, rad/s"""
     smoothing: Positive = Field(0.03, le=1.0)
     """time constant of the velocity on axes of force, s"""
 
 
 class ForceTask(NamedTuple):
-    """The axes of force, and the contact as it is. Vectors (6,) are in the task frame."""
+    """The axes of force and the present contact. Vectors (6,) are in the task frame."""
 
-    rotation: Array  # (3, 3), of the task frame in the world
+    rotation: Array  # (3, 3), task frame in the world
     selected: Mask  # (6,), axes of force
-    wanted: Array  # (6,), N, N m: of the tool on the surroundings, on axes of force
-    # (6,), N, N m: of the tool on the surroundings; None: not known, so force axes rest.
+    wanted: Array  # (6,), N, N m: wanted wrench of the tool on the surroundings
+    # (6,), N, N m: present wrench of the tool. If it is None, axes of force rest.
     exerted: Array | None
-    speed: Array  # (6,), m/s, rad/s: most on axes of force
+    speed: Array  # (6,), m/s, rad/s: largest velocity on axes of force
 
 
 class JointMotion(NamedTuple):
-    """What the joints are to do, (joints,) each."""
+    """Motion for the joints, (joints,) each."""
 
     position: Array  # rad
     velocity: Array  # rad/s
     acceleration: Array  # rad/s2
     inertia: Array  # kg m2: diagonal of the joint-space inertia
-    load: Array  # N m: of gravity, of motion, and of the force wanted
+    load: Array  # N m: torques of gravity, velocities and the wanted force
 
 
 class ToolKinematics:
@@ -89,7 +89,13 @@ class ToolKinematics:
         self._whole = np.zeros((AXES, cell.model.nv))
 
     def look(self, position: Array, velocity: Array, payload: Payload | None = None) -> None:
-        """Evaluate at rad, rad/s, (joints,) each."""
+        """Evaluate a state.
+
+        Args:
+            position: (joints,), rad.
+            velocity: (joints,), rad/s.
+            payload: Payload at the tool, or None.
+        """
         self.terms = self._dynamics.terms(position, velocity, payload)
         model, data = self._dynamics.evaluated
         mujoco.mj_jacSite(model, data, self._whole[:3], self._whole[3:], self._cell.tool)
@@ -112,39 +118,45 @@ class HybridLaw:
         self._there = ToolKinematics(cell)
         self._here = ToolKinematics(cell)
         self._by_joint = np.zeros((3, joints))
-        # dq, its velocity, and dq of a motion without force.
+        # dq, its velocity, and dq when no axis was of force last.
         self._away, self._speed, self._base = self._by_joint
         self._by_axis = np.zeros((2, AXES))
-        # N, N m: fed forward, in the world's frame; m/s, rad/s: on the axes of force, in the task
-        # frame.
+        # Wrench fed forward, N, N m, in the world frame. Velocity on the axes of force, m/s, rad/s,
+        # in the task frame.
         self._forward, self._forced = self._by_axis
-        self.offset = np.zeros(3)  # (3,), m: from where the motion alone would have the tool
+        # (3,), m: offset of the tool from its place without force control.
+        self.offset = np.zeros(3)
 
     def begin(self) -> None:
-        """Begin without a difference from the motion, at rest."""
+        """Start at rest without a difference from the motion."""
         for numbers in (self._by_joint, self._by_axis, self.offset):
             numbers[:] = 0.0
 
     @property
     def rests(self) -> bool:
-        """Whether the difference from the motion does not change."""
+        """True if the difference from the motion does not change."""
         return not self._speed.any()
 
     def step(
         self, motion: Motion, task: ForceTask | None, passed_s: float, payload: Payload
     ) -> JointMotion:
-        """Return the command for a `motion`, `passed_s` after the last; without a `task` all axes
-        are of motion.
+        """Compute the command for one cycle.
+
+        Args:
+            motion: Motion of the level above.
+            task: Axes of force, or None if all axes are of motion.
+            passed_s: Time since the last cycle.
+            payload: Payload at the tool.
         """
         q = motion.position
         qd = motion.velocity
         wanted = np.zeros(len(q)) if task is None else self._velocity(motion, task, passed_s) - qd
         change = wanted - self._speed
-        most = self._limits.acceleration * passed_s
-        part = float((np.abs(change) / most).max())
+        max_change = self._limits.acceleration * passed_s
+        excess = float((np.abs(change) / max_change).max())
         before = self._speed.copy()
-        if part > 1.0:
-            change /= part
+        if excess > 1.0:
+            change /= excess
         self._speed += change
         self._away += (0.5 * passed_s) * (before + self._speed)
         low, high = self._limits.position.T
@@ -160,19 +172,17 @@ class HybridLaw:
         )
 
     def _velocity(self, motion: Motion, task: ForceTask, passed_s: float) -> Array:
-        """Return the joint velocities, rad/s, that follow the motion on its axes, and move for
-        force on the others.
-        """
+        """Return the joint velocities that follow the motion and the wanted force, rad/s."""
         self._there.look(motion.position + self._base, motion.velocity)
         self._here.look(motion.position + self._away, motion.velocity + self._speed)
-        there = self._there.pose
-        here = self._here.pose
+        motion_pose = self._there.pose
+        present_pose = self._here.pose
         turn = np.zeros(3)
         error = np.zeros(AXES)
-        error[:3] = there.position - here.position
+        error[:3] = motion_pose.position - present_pose.position
         self.offset[:] = -error[:3]
-        mujoco.mju_subQuat(turn, there.quaternion, here.quaternion)
-        mujoco.mju_rotVecQuat(error[3:], turn, here.quaternion)
+        mujoco.mju_subQuat(turn, motion_pose.quaternion, present_pose.quaternion)
+        mujoco.mju_rotVecQuat(error[3:], turn, present_pose.quaternion)
         wanted = mat_vec(self._there.jacobian, motion.velocity) + CATCH_UP * error
         twist = turned(task.rotation.T, wanted)
         forced = np.zeros(AXES)
@@ -194,8 +204,9 @@ class HybridLaw:
         passed_s: float,
         payload: Payload,
     ) -> tuple[Array, Array]:
-        """Return inertia and load, N m, there; the force fed forward follows the one wanted at the
-        loop's pace.
+        """Return inertia, kg m2, and load, N m, of the joints at the commanded state.
+
+        The force that is fed forward follows the wanted force with the bandwidth of the loop.
         """
         self._here.look(position, velocity, payload)
         forward = (
@@ -209,7 +220,10 @@ class HybridLaw:
 
 
 def turned(rotation: Array, vector: Array) -> Array:
-    """Return both halves of `vector` (6,) turned by `rotation` (3, 3)."""
+    """Rotate both halves of a vector.
+
+    The vector is (6,), the rotation matrix (3, 3).
+    """
     rotation = np.ascontiguousarray(rotation)
     return np.concatenate(
         (mat_vec(rotation, vector[:3].copy()), mat_vec(rotation, vector[3:].copy()))
@@ -217,8 +231,9 @@ def turned(rotation: Array, vector: Array) -> Array:
 
 
 def damped_inverse(jacobian: Array, twist: Array) -> Array:
-    """Return the joint velocities J^T (J J^T + d)^-1 `twist` (6,): finite near singularities, see
-    `DAMPING`.
+    """Return the joint velocities J^T (J J^T + d)^-1 `twist`, finite near singularities.
+
+    The twist is (6,), m/s, rad/s. See `DAMPING` for d.
     """
     square = gram(np.ascontiguousarray(jacobian.T))
     square.flat[:: AXES + 1] += DAMPING

@@ -1,5 +1,7 @@
-"""The executor of a server of force and motion: does a client's requests, those of a trajectory
-level, COMPLY and GUARD, and outlives the client.
+"""The executor of a server of force and motion.
+
+It carries out the requests of a client: motions, as a trajectory level does, COMPLY and GUARD. When
+the client is lost, it brings the arm to a safe state.
 """
 
 from __future__ import annotations
@@ -33,26 +35,26 @@ from rack.levels.systems.trajectory.messages import MotionKind, MotionRequest, R
 from rack.levels.systems.trajectory.motion import SampledMotion
 from rack.levels.systems.trajectory.request_work import MotionTools, RequestWork, TrajectoryParams
 from rack.levels.systems.trajectory.requests import Agenda
-from rack.levels.tables import Positive, read_params
+from rack.levels.tables import Positive
 
 LEAST = np.array([5.0] * 3 + [0.5] * 3)
-"""N, N m: of a smaller wanted wrench the tolerance is that of these: dry friction and noise do not
-scale."""
+"""Wrench, N, N m, whose tolerance also applies to smaller wrenches, because dry friction and noise
+do not scale with the wrench."""
 
 
 class ServerParams(TrajectoryParams):
-    """`[board.<name>.params]`: how contacts are judged, and what happens without a client."""
+    """`[board.<name>.params]`: how contacts are judged, and the reaction to a lost client."""
 
     speed: Positive = 0.05
-    """most on an axis of force, where a request gives none, m/s"""
+    """largest velocity on an axis of force if a request gives none, m/s"""
     turning: Positive = 0.2
-    """the same about an axis, rad/s"""
+    """largest velocity about an axis of force if a request gives none, rad/s"""
     tolerance: Positive = Field(0.3, le=1.0)
-    """part of a wanted force by which it may be off"""
+    """permitted error of a force, as a part of the wanted one"""
     settle: Positive = 0.2
-    """time for which forces are within it when they are settled, and a COMPLY is done, s"""
+    """time within the tolerance after which forces are settled and a COMPLY is done, s"""
     reach: Positive = 4.0
-    """longest time without settled forces, s: then compliance ends"""
+    """time without settled forces after which compliance ends, s"""
     silence: Positive = 2.0
     """time without a sign of life after which the client is lost, s"""
     hold: Positive = 3.0
@@ -62,27 +64,27 @@ class ServerParams(TrajectoryParams):
 class ServerWork(RequestWork):
     """Begins and ends compliance, and judges contacts: see `ServerRequest`.
 
-    Motion begins anew from where the arm is when axes cease to be of force, or are others: the
-    boards below come to rest and hold, and fall into step again.
+    When axes cease to be axes of force, or other axes become so, motion restarts from where the arm
+    is: the boards below come to rest and hold, and get into step again.
     """
 
     boards: JointBoards
-    """Those below."""
+    """The boards below."""
     most: tuple[float, float]
     """Limits on a contact, N and N m."""
 
     def __init__(self, agenda: Agenda, motion: SampledMotion, tools: MotionTools) -> None:
         super().__init__(agenda, motion, tools)
         self.contact = Contact()
-        # That answers the contact in force; None: none does yet.
+        # Status that answers the contact in force, or None before there is one.
         self.force: ForceStatus | None = None
-        self.guarded = 0  # newest request that a guard has ended
-        self.axis = -1  # of that guard
-        self._on_s = 0.0  # time for which all forces are as wanted
-        self._off_s = 0.0  # time since they were settled
+        self.guarded = 0  # id of the newest request that a guard has ended
+        self.axis = -1  # axis of that guard
+        self._on_s = 0.0  # time for which all forces have been as wanted
+        self._off_s = 0.0  # time since forces were settled
 
     def step(self, time_s: float, hold: bool) -> None:
-        """Go on to the sample at `time_s`; with `hold`, ramp to rest. Judge the contact."""
+        """Advance to the sample at `time_s`, and judge the contact. With `hold`, ramp to rest."""
         super().step(time_s, hold)
         if self.contact.complies:
             self._judge()
@@ -90,7 +92,7 @@ class ServerWork(RequestWork):
             self._on_s = self._off_s = 0.0
 
     def strike(self, axis: int) -> None:
-        """End the request under way: a guard was struck."""
+        """End the request under way, because a guard was struck."""
         current = self.agenda.current
         if current is not None and current.kind != MotionKind.CANCEL:
             self.guarded = current.id
@@ -100,7 +102,13 @@ class ServerWork(RequestWork):
         self._begin_anew(f"the arm comes to rest: guard of axis {AXIS_NAMES[axis]}")
 
     def drop(self, how: RequestEnd, reason: str, code: Error) -> None:
-        """End all requests with an error; the arm ramps to rest on the axes of motion."""
+        """End all requests with an error. The arm ramps to rest on the axes of motion.
+
+        Args:
+            how: End to report.
+            reason: Reason to report.
+            code: Error code to report.
+        """
         self._fail(how, reason, code)
         self.motion.stop()
 
@@ -112,9 +120,7 @@ class ServerWork(RequestWork):
             self._begin_anew("the arm comes to rest: compliance ends")
 
     def off(self) -> Array:
-        """Return by how much forces are off, (6,), as parts of what is tolerated; 0 on axes of
-        motion.
-        """
+        """Return the force errors as multiples of the tolerance, (6,), 0 on axes of motion."""
         contact = self.contact
         force = self.force
         if force is None:
@@ -126,24 +132,23 @@ class ServerWork(RequestWork):
 
     @property
     def _params(self) -> ServerParams:
+        """Parameters of the board."""
         params = self._tools.params
         assert isinstance(params, ServerParams)
         return params
 
     def _judge(self) -> None:
-        """Count how long forces have been as wanted; end compliance when they have not settled for
-        too long.
-        """
-        off = self.off()
+        """Count how long forces have been as wanted. End compliance if they do not settle."""
+        errors = self.off()
         current = self.agenda.current
         params = self._params
         period_s = self._tools.period_s
-        self._on_s = 0.0 if (off > 1.0).any() else self._on_s + period_s
+        self._on_s = 0.0 if (errors > 1.0).any() else self._on_s + period_s
         self._off_s = 0.0 if self._on_s >= params.settle else self._off_s + period_s
         if current is not None and current.kind == MotionKind.COMPLY:
             self.passed_s = self._on_s
         if self._off_s > params.reach:
-            axis = int(off.argmax())
+            axis = int(errors.argmax())
             felt = 0.0 if self.force is None else -self.force.wrench[axis]
             wanted = (
                 f"axis {AXIS_NAMES[axis]} has not settled at {self.contact.wrench[axis]:g}"
@@ -154,12 +159,14 @@ class ServerWork(RequestWork):
             )
             self.release()
 
-    def _begin_anew(self, why: str) -> None:
-        self.agenda.goal = None  # the arm is not there
-        self.boards.leave(why)
+    def _begin_anew(self, reason: str) -> None:
+        """Restart the motion from where the boards below come to rest."""
+        self.agenda.goal = None  # the arm is not at the goal of a request
+        self.boards.leave(reason)
         self.interrupt()
 
     def _misfit(self, request: MotionRequest) -> str:
+        """Return why a request is impossible, or an empty text."""
         wanted = Wanted.of(request.record)
         frame = wanted.frame
         if request.kind == MotionKind.COMPLY:
@@ -170,12 +177,13 @@ class ServerWork(RequestWork):
         return super()._misfit(request)
 
     def _start(self, request: MotionRequest) -> None:
+        """Start a request: set guards or axes of force, or begin a motion."""
         wanted = Wanted.of(request.record)
         if request.kind == MotionKind.GUARD:
             self.contact.watch(wanted.frame, wanted.guard)
         elif request.kind == MotionKind.COMPLY and wanted.selected.any():
-            usual = np.array([self._params.speed] * 3 + [self._params.turning] * 3)
-            speed = np.where(wanted.speed > 0.0, wanted.speed, usual)
+            default_speed = np.array([self._params.speed] * 3 + [self._params.turning] * 3)
+            speed = np.where(wanted.speed > 0.0, wanted.speed, default_speed)
             self._on_s = self._off_s = 0.0
             if self.contact.comply(wanted._replace(speed=speed)):
                 self._begin_anew("the arm comes to rest: other axes of force")
@@ -185,6 +193,7 @@ class ServerWork(RequestWork):
             super()._start(request)
 
     def _is_done(self, current: MotionRequest) -> bool:
+        """Return True if the current request is done. A COMPLY needs settled forces and rest."""
         if current.kind != MotionKind.COMPLY:
             return super()._is_done(current)
         return self.motion.settled and (
@@ -192,19 +201,18 @@ class ServerWork(RequestWork):
         )
 
     def _lasts_s(self, request: MotionRequest) -> float:
+        """Return the expected duration of a request, s."""
         if request.kind == MotionKind.COMPLY and self.contact.complies:
             return self._params.settle
         return super()._lasts_s(request)
 
 
 class ForceServer(WristLevel, TrajectoryExecutor):
-    """A trajectory level above one of hybrid control, which makes axes of a task frame ones of
-    force.
+    """A trajectory level above hybrid control, which can make axes of a task frame axes of force.
 
-    A client that falls silent while requests are left, or while axes are of force, is lost: its
+    A client that falls silent while requests are left, or while axes are of force, is lost. Its
     requests are CANCELLED, and the arm comes to rest on the axes of motion. Forces are held for
-    `hold`, go to zero, and the arm holds where it then is. What comes meanwhile is REFUSED until a
-    CANCEL.
+    `hold`, then go to zero, and the arm holds its position. Requests are REFUSED until a CANCEL.
     """
 
     requests = Input(ServerRequest, "above.requests")
@@ -216,24 +224,24 @@ class ForceServer(WristLevel, TrajectoryExecutor):
     state = Output(ServerState)
     compliance = Output(Compliance)
     params = ServerParams
+    settings: ServerParams
     work = ServerWork
     _work: ServerWork
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        self._params = read_params(ServerParams, context.params)
         self._work.boards = self._boards
         wrist = context.robot.wrist
         assert wrist is not None, "`misfits` refuses an arm without a sensor"
         self._work.most = wrist.most_force, wrist.most_torque
         self._now = 0  # tick of this cycle
-        self._heard = -1  # tick of the client's last sign of life; -1: not yet counted
+        self._heard = -1  # tick of the client's last sign of life, or -1 before the first cycle
         self._without = Mode.MOTION  # mode without a client
-        self._since = 0  # tick since when
+        self._since = 0  # tick at which that mode began
         self._sensed = np.array(context.robot.home)  # (joints,), rad
 
     def process(self, tick: int) -> None:
-        """Take requests, look at client and contact, go on with the motion."""
+        """Do one cycle: take requests, check client and contact, continue the motion."""
         self._now = tick
         if self._heard < 0 or self.requests.is_new:
             self._heard = tick
@@ -244,12 +252,13 @@ class ForceServer(WristLevel, TrajectoryExecutor):
 
     @property
     def mode(self) -> Mode:
-        """What the server does."""
+        """Present mode of the server."""
         if self._agenda.error is Error.CLIENT:
             return self._without
         return Mode.FORCE if self._work.contact.complies else Mode.MOTION
 
     def _recall(self) -> None:
+        """Continue from the last messages after a restart, including the contact."""
         super()._recall()
         if self.last_compliance.is_there and self.last_status.is_there:
             self._work.contact.recall(self.last_compliance.message)
@@ -260,11 +269,12 @@ class ForceServer(WristLevel, TrajectoryExecutor):
             self._since = self._now
 
     def _follow_boards(self) -> None:
+        """Process the statuses of the boards below, the contact and the client."""
         super()._follow_boards()
         for below in self.boards.values():
             if below.is_there:
                 self._sensed = below.message.position
-        # Take over the newest contact; a guard that was struck ends the request under way.
+        # Use the newest status of the contact. A guard that was struck ends the present request.
         status = self.force.message
         work = self._work
         answers = (
@@ -279,17 +289,17 @@ class ForceServer(WristLevel, TrajectoryExecutor):
         self._miss_client()
 
     def _miss_client(self) -> None:
-        """Outlive a client that is lost."""
+        """React to a client that is lost: hold, then release forces, then hold the position."""
         work = self._work
-        params = self._params
+        params = self.settings
         agenda = self._agenda
         if agenda.error is not Error.CLIENT:
             if self._passed_s(self._heard) > params.silence and (
                 agenda.held or work.contact.complies
             ):
-                self._work.drop(RequestEnd.CANCELLED, "", Error.CLIENT)
-                if self._work.contact.complies:
-                    self._enter(Mode.HELD, f"forces are held for {self._params.hold:g} s")
+                work.drop(RequestEnd.CANCELLED, "", Error.CLIENT)
+                if work.contact.complies:
+                    self._enter(Mode.HELD, f"forces are held for {params.hold:g} s")
                 else:
                     self._enter(Mode.RELEASED, "the position is held")
         elif self._without is Mode.HELD and self._passed_s(self._since) > params.hold:
@@ -301,17 +311,19 @@ class ForceServer(WristLevel, TrajectoryExecutor):
                 work.release()
                 self._enter(Mode.RELEASED, "forces released, the position is held")
 
-    def _enter(self, mode: Mode, what: str) -> None:
+    def _enter(self, mode: Mode, description: str) -> None:
+        """Enter a mode without a client; `description` describes it in the reason."""
         self._without = mode
         self._since = self._now
-        silent = f"no sign of life from the client for {self._params.silence:g} s"
-        self._agenda.reason = f"{silent}: {what}; cancel, then go on"
+        silent = f"no sign of life from the client for {self.settings.silence:g} s"
+        self._agenda.reason = f"{silent}: {description}; cancel, then go on"
 
     def _passed_s(self, tick: int) -> float:
+        """Return the time since `tick`, s."""
         return (self._now - tick) * self.context.tick_s
 
     def _show(self, status: ServerStatus) -> None:
-        """Fill what a server's status says beyond a trajectory level's."""
+        """Fill the fields that a server's status has in addition to a trajectory level's."""
         work = self._work
         force = work.force
         status.mode = self.mode

@@ -53,7 +53,7 @@ from rack.levels.level import LevelContext
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import FRICTION_SPEED, Dynamics
 from rack.levels.robot.hand import Hand
-from rack.levels.servo.driver import numbers
+from rack.levels.servo.arm_report import numbers
 from rack.levels.systems.hand.kinematics import FingerKinematics
 from rack.levels.systems.hand.messages import FingerMode, FingerTarget, GraspTarget, HandStatus
 from rack.levels.tables import NotNegative, Positive, Table

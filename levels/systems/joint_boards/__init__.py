@@ -1,6 +1,4 @@
-"""Joints servoed by boards of their own: the arm's board gets their torques; a gateway joins them
-to a level above.
-"""
+"""Joints that separate boards servo, the arm that they share, and a gateway to a level above."""
 
 from rack.levels.systems.joint_boards.arm_executor import ArmExecutor
 from rack.levels.systems.joint_boards.gateway import JointGateway, NetworkGateway

@@ -1,6 +1,4 @@
-"""The executor of a board of the arm: gives it the torques of the boards that servo its joints, or
-brakes it.
-"""
+"""The executor of a board of the arm: applies the torques of the boards that servo its joints."""
 
 from __future__ import annotations
 
@@ -16,8 +14,9 @@ from rack.levels.messages import ArmState
 from rack.levels.operator import DRIVES, HOLDABLE, OperatorCommand, Orders
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import Payload
+from rack.levels.servo.arm_report import SetPointStatus, numbers
 from rack.levels.servo.curves import Motion
-from rack.levels.servo.driver import SCENES, ArmDriver, Course, numbers
+from rack.levels.servo.driver import SCENES, ArmDriver
 from rack.levels.servo.reference import ASTRAY_RAD
 from rack.levels.servo.stopping import Reaction
 from rack.levels.systems.joint_boards.messages import ArmStatus, JointTorque
@@ -26,31 +25,39 @@ HELD = "held by the operator; `resume` releases it"
 
 
 class JointTorques(CommandsAbove):
-    """Adds up the `JointTorque`s of the boards above; each is 0 for the joints of other boards."""
+    """Adds up the `JointTorque`s of the boards above.
+
+    Each is 0 for the joints of other boards.
+
+    Attributes:
+        torque: Torques of all boards, (joints,), N m.
+        wanted: Motion that the boards want. Its accelerations are not known.
+        moves: A joint should move.
+        rests_on: Serial of the newest operator's command on which the torques are based.
+    """
 
     def __init__(self, context: LevelContext, cell: Cell) -> None:
         super().__init__(context, cell.patience, 1, "torque", "braked")
         joints = len(cell.home)
         # The fields of a `JointTorque` from `torque` to `payload_offset`.
         self._sum = np.zeros(3 * joints + 5)
-        self.torque = self._sum[:joints]  # (joints,), N m
-        # Where the boards want the joints; accelerations are not known.
+        self.torque = self._sum[:joints]
         self.wanted = Motion(np.zeros((3, joints)))
-        self.moves = False  # a joint is wanted to move
-        self.rests_on = 0  # serial of the newest command of an operator that the torques rest on
+        self.moves = False
+        self.rests_on = 0
 
     @property
     def grip_force(self) -> float:
-        """The gripper's force, N."""
+        """Force of the gripper, N."""
         return float(self._sum[-5])
 
     @property
     def payload(self) -> Payload:
-        """The mass in the gripper, as the boards know it."""
+        """Payload in the gripper according to the boards."""
         return Payload(float(self._sum[-4]), self._sum[-3:])
 
     def add_up(self, commands: Mapping[str, Reading[JointTorque]]) -> None:
-        """Set `torque`, `wanted`, `grip_force` and `payload`, while nothing is `missing`."""
+        """Add up the commands of all boards. Only valid while none is `missing`."""
         self.rests_on = 0
         self._sum[:] = 0.0
         for board in self.oldest:
@@ -65,10 +72,10 @@ class JointTorques(CommandsAbove):
 class ArmExecutor(ArmDriver):
     """Drives an arm with the torques of the boards above: all of its joints, or none.
 
-    While it says `stopped`, these boards bring the joints to rest and hold them; an arm that is
-    still not at rest after the time that this takes is braked. A board that is lost or late brakes
-    the arm. It is released when all boards have seen that it was braked: their torques then hold it
-    where it is. See `ArmDriver`.
+    While it reports `stopped`, these boards must bring the joints to rest and hold them. An arm
+    that is not at rest after the time that this takes is braked. A board that is lost or late
+    brakes the arm, too. The brakes are released when all boards have seen that the arm was braked;
+    their torques then hold it where it is. See `ArmDriver`.
     """
 
     joint_torques = Inputs(JointTorque, "above.command")
@@ -86,10 +93,10 @@ class ArmExecutor(ArmDriver):
         self.orders = Orders(self.commands)
         rest_s = float(np.max(limits.velocity / limits.acceleration))
         self._rest_ticks = round(rest_s / context.tick_s) + max(self.joints.oldest.values())
-        self._defied = False  # the boards above have not brought it to rest in that time
-        # Tick by which the arm must have come to rest; None: it need not.
+        self._defied = False  # the boards above have not brought the arm to rest in time
+        # Tick by which the arm must be at rest, or None.
         self._rest_by: int | None = None
-        # Tick of the first status that said so; None: not braked, or not yet said.
+        # Tick of the first status that reports the brakes, or None.
         self._braked_at: int | None = None
         self._torques: Mapping[str, Reading[JointTorque]] = {}
         self._waiting = ""  # why the boards above do not drive the arm
@@ -98,8 +105,9 @@ class ArmExecutor(ArmDriver):
     def misfits(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Misfits:
-        """Yield every joint, and the gripper, that not exactly one board above drives, and what
-        `ArmDriver` yields.
+        """Yield joints, and the gripper, that not exactly one board above drives.
+
+        Yields what `ArmDriver` yields, too.
         """
         yield from super().misfits(context, above, below)
         everything = context.robot.joints
@@ -114,28 +122,28 @@ class ArmExecutor(ArmDriver):
                 )
         grips = [other.board for other in above if other.params.get("gripper", False)]
         if len(grips) != (context.robot.gripper is not None):
-            must = "the gripper must be commanded by one board"
+            text = "the gripper must be commanded by one board"
             if context.robot.gripper is None:
-                must = "the arm has no gripper"
-            yield "above", list(wanted), f"{must}; {_by(grips)}"
+                text = "the arm has no gripper"
+            yield "above", list(wanted), f"{text}; {_by(grips)}"
 
     def process(self, tick: int) -> None:
-        """Advance the arm to `tick`, sense, drive or brake, report."""
+        """Do the cycle of an arm, and write its tick to the status."""
         self.status.tick = tick
         super().process(tick)
 
     def take_messages(self) -> None:
-        """Take over what is new."""
+        """Read the torques of the boards above and the commands of the operator."""
         self._torques = self.joint_torques
         self.orders.take(self.operator, self._judge)
 
     def _judge(self, command: OperatorCommand) -> None:
-        """Obey what leaves the command in force as it is, or refuse it."""
-        if command.what in DRIVES and (why := self.obey(command)):
-            self.orders.refuse(why)
+        """Obey or refuse a command for the drives, which leaves the one in force unchanged."""
+        if command.what in DRIVES and (refusal := self.obey(command)):
+            self.orders.refuse(refusal)
 
     def next_motion(self, reaction: Reaction, missed: bool, tick: int) -> Motion | None:
-        """Return where the boards above want the arm; None: not all of them drive it."""
+        """Return the motion that the boards above want, or None if not all of them drive it."""
         if self.arm.braked and self._braked_at is None:
             self._waiting = "braked until the boards above have seen it"
             return None
@@ -160,14 +168,14 @@ class ArmExecutor(ArmDriver):
         return self.joints.wanted
 
     def _is_astray(self) -> bool:
-        """Return whether the boards above want the arm elsewhere than where it is braked.
+        """Return True if the boards above want the braked arm elsewhere than where it is.
 
-        They do for two cycles when sensors are trusted again and show another position than was
-        estimated.
+        This happens for two cycles when sensors are trusted again and show another position than
+        was estimated.
         """
-        away = self.joints.wanted.position - self.sensors.position
-        joint = int(np.abs(away).argmax())
-        if abs(away[joint]) <= ASTRAY_RAD:
+        distance = self.joints.wanted.position - self.sensors.position
+        joint = int(np.abs(distance).argmax())
+        if abs(distance[joint]) <= ASTRAY_RAD:
             return False
         name = self.context.robot.joints[joint]
         self._waiting = (
@@ -176,9 +184,7 @@ class ArmExecutor(ArmDriver):
         return True
 
     def _must_rest(self, stops: bool, tick: int) -> bool:
-        """Return whether the arm `stops`, and the boards above have had enough time to bring it to
-        rest.
-        """
+        """Return True if the arm `stops` and the boards above have had time to bring it to rest."""
         if not stops:
             self._rest_by = None
         elif self._rest_by is None:
@@ -198,30 +204,26 @@ class ArmExecutor(ArmDriver):
 
     @property
     def payload(self) -> Payload:
-        """What the gripper holds, by the boards above."""
+        """Payload in the gripper according to the boards above."""
         return self.joints.payload
 
     @property
     def holds(self) -> bool:
-        """Whether the gripper holds a part, by the boards above."""
+        """True if the gripper holds a part according to the boards above."""
         return self.payload.mass > 0.0
 
-    @property
-    def has_work(self) -> bool:
-        """Return True: the arm is there to be driven."""
-        return True
-
-    def course(self, reaction: Reaction) -> Course:
-        """Return what the status says of the torques from above."""
-        held = self.orders.holds
-        kept = self.stopping.reason or self._waiting
-        if held and not kept:
-            kept = HELD
+    def course(self, reaction: Reaction) -> SetPointStatus:
+        """Return how the arm follows the torques from above, for the status."""
+        is_held = self.orders.holds
+        reason = self.stopping.reason or self._waiting
+        if is_held and not reason:
+            reason = HELD
         holding = self.abandoned or not self.joints.moves
-        stopped = self.abandoned or reaction > 0 or held
-        return Course(0, holding, stopped, 0, kept)
+        stopped = self.abandoned or reaction > 0 or is_held
+        return SetPointStatus(0, holding, stopped, 0, reason, has_work=True)
 
 
 def _by(boards: Sequence[str]) -> str:
+    """Describe which boards command something."""
     named = ", ".join(f"'{board}'" for board in boards)
     return f"it is commanded by {named or 'none'}"

@@ -1,5 +1,6 @@
-"""Executors of a board that joins a trajectory level to boards that servo joints: across a link
-with a delay, or across a network, where the level above runs in another rack.
+"""Executors of a board between a trajectory level and boards that servo joints.
+
+The board bridges a link with a delay, or a network if the level above runs in another rack.
 """
 
 from __future__ import annotations
@@ -16,32 +17,34 @@ from rack.levels.messages import TaskStatus
 from rack.levels.peer import PeerPresence, Presence
 from rack.levels.servo.reference import MAX_AHEAD_S
 from rack.levels.systems.joint_boards.messages import JointReference, JointStatus
-from rack.levels.tables import NotNegative, Positive, Table, read_params
+from rack.levels.tables import NotNegative, Positive, Table
 
 LEAD_CYCLES = 2
-"""Cycles of this board until a reference that is there has come to the boards below: they need it
-in time."""
+"""Cycles that a reference takes from its arrival at this board to the boards below."""
 
 Link = deque[tuple[int, bytes]]
-"""Messages on their way, each with the tick at which it arrives."""
+"""Messages in transit, each with its tick of arrival."""
 
 
 class GatewayParams(Table):
-    """`[board.<name>.params]`: the link to the level above, and what to do without it."""
+    """`[board.<name>.params]`: the link to the level above, and missing references."""
 
     delay: NotNegative = Field(0.0, le=1.0)
-    """time that the link takes, each way, s"""
+    """delay of the link in each direction, s"""
     missing: int = Field(5, ge=0, le=1000)
-    """references in a row that may be missing and are extrapolated"""
+    """consecutive references that may be missing and are extrapolated"""
 
 
 class JointGateway(Executor):
-    """Hands references on to the boards below, later by a constant time; makes up those that are
-    missing.
+    """Passes references to the boards below after a constant delay, and extrapolates missing ones.
 
-    A reference that is not there in time is extrapolated from the newest, at its velocity. After
-    `missing` of them the arm is left to the boards below, which ramp to rest and hold; when
-    references come again, they join them. Upwards the boards below appear as one.
+    A reference that is not there in time is extrapolated from the newest one at its velocity. After
+    `missing` of them the arm is left to the boards below, which ramp to rest and hold. When
+    references arrive again, these boards join them. To the level above, the boards below appear as
+    one.
+
+    Attributes:
+        latency: Ticks by which references are due later.
     """
 
     above = Input(JointReference, "above.command")
@@ -49,27 +52,28 @@ class JointGateway(Executor):
     command = Output(JointReference, rests_on=above)
     status = Output(JointStatus, rests_on=statuses)
     params: ClassVar[type[GatewayParams]] = GatewayParams
+    settings: GatewayParams
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        params = read_params(self.params, context.params)
+        params = self.settings
         every = context.every
-        # Ticks, in whole cycles.
+        # Ticks, rounded up to whole cycles.
         self._delay = -(-round(params.delay / context.tick_s) // every) * every
-        self.latency = self._delay + LEAD_CYCLES * every  # ticks by which references are due later
+        self.latency = self._delay + LEAD_CYCLES * every
         self._missing = params.missing
-        # Ticks from reference to reference; none if the level above is not of this rack.
+        # Ticks from reference to reference. 0 if the level above belongs to another rack.
         self._period = max((pace.every for pace in context.above.values()), default=0)
         self._above = ", ".join(context.above)
         self._down: Link = deque()
         self._up: Link = deque()
-        self._newest = JointReference.zeros(context.sizes)  # reference that came
-        self._merged = JointStatus.zeros(context.sizes)  # of the boards below, as one
-        self._due = 0  # tick at which the last reference given is due; 0: none is followed
-        self._frozen = False  # too many are missing
+        self._newest = JointReference.zeros(context.sizes)  # newest reference that has arrived
+        self._merged = JointStatus.zeros(context.sizes)  # status of the boards below as one
+        self._due = 0  # tick at which the last reference passed down is due, or 0
+        self._frozen = False  # too many references are missing
 
     def process(self, tick: int) -> None:
-        """Hand references down, and statuses up."""
+        """Pass references down and statuses up."""
         self._take(self.above, tick)
         newest = self._newest
         due = newest.due + self.latency if newest.due else 0
@@ -79,27 +83,27 @@ class JointGateway(Executor):
             self._frozen = False
         elif self._due and tick + LEAD_CYCLES * self.context.every > self._due:
             self._extrapolate(self.command)
-        # Put the status of the boards below on the link; show the one that has passed it.
+        # Put the status of the boards below on the link, and write the one that arrives.
         self._merge(self.statuses)
         self._up.append((tick + self._delay, bytes(self._merged.raw)))
         take_arrived(self._up, self.status, tick)
 
     def _take(self, command: Reading[JointReference], tick: int) -> None:
-        """Put what is new on the link; take what has passed it."""
+        """Put a new reference on the link, and receive the one that arrives."""
         if command.is_new:
             self._down.append((tick + self._delay, bytes(command.message.raw)))
         take_arrived(self._down, self._newest, tick)
 
     def _extrapolate(self, command: JointReference) -> None:
-        """Make up the reference after the last one given, or give up."""
+        """Extrapolate the next reference, or give up if too many are missing."""
         newest = self._newest
-        ahead = self._due + self._period - self.latency - newest.due  # ticks
-        if ahead > self._missing * self._period:
+        ahead_ticks = self._due + self._period - self.latency - newest.due  # ticks
+        if ahead_ticks > self._missing * self._period:
             self._due = command.due = 0
             self._frozen = True
             return
         self._due += self._period
-        ahead_s = ahead * self.context.tick_s
+        ahead_s = ahead_ticks * self.context.tick_s
         command.due = self._due
         command.id = newest.id
         command.position[:] = newest.position + ahead_s * newest.velocity
@@ -107,6 +111,7 @@ class JointGateway(Executor):
         command.acceleration[:] = 0.0
 
     def _merge(self, statuses: Mapping[str, Reading[JointStatus]]) -> None:
+        """Combine the statuses of the boards below to one."""
         merged = self._merged
         values = [reading.message for reading in statuses.values()]
         merged.position[:] = values[0].position
@@ -137,7 +142,13 @@ class JointGateway(Executor):
 
 
 def take_arrived(link: Link, message: Message, tick: int) -> None:
-    """Let what has arrived by `tick` replace `message`, the newest last."""
+    """Copy the newest message that has arrived by `tick` to `message`, if any.
+
+    Args:
+        link: Link, from which arrived messages are removed.
+        message: Message to replace.
+        tick: Present tick.
+    """
     while link and link[0][0] <= tick:
         message.raw[:] = link.popleft()[1]
 
@@ -145,9 +156,9 @@ def take_arrived(link: Link, message: Message, tick: int) -> None:
 LOST = "the other rack is lost"
 NOT_COMPARED = "the clocks of both racks are not compared yet"
 STATUS_CYCLES = 10
-"""Cycles of this board from status to status: at 500 Hz no more often than a network permits."""
+"""Cycles of this board from status to status, which at 500 Hz suits a network."""
 SLACK_S = 0.002
-"""Error of the other rack's time that is left alone: correcting it would jolt the motion."""
+"""Error of the other rack's time that is not corrected, because that would jolt the motion."""
 
 
 class NetworkGatewayParams(GatewayParams):
@@ -160,10 +171,11 @@ class NetworkGatewayParams(GatewayParams):
 
 
 class NetworkGateway(JointGateway):
-    """Follows references of another rack, due later by `delay`, within which they must have come.
+    """Follows references of another rack, which become due later by `delay`.
 
-    They are due at ticks of that rack, whose time next to ours its `PeerPresence` shows. The board
-    is DONE, or in ERROR, when the program of that rack is: then it may end the run.
+    They must arrive within this time. Their due ticks count on the clock of the other rack, whose
+    time relative to this rack is in its `PeerPresence`. The board is DONE, or in ERROR, when the
+    program of the other rack is, so that it can end the run.
     """
 
     above = Input(JointReference, "lan.reference")
@@ -172,31 +184,31 @@ class NetworkGateway(JointGateway):
     command = Output(JointReference, rests_on=above)
     status = Output(JointStatus, cycles=STATUS_CYCLES, rests_on=JointGateway.statuses)
     params = NetworkGatewayParams
+    settings: NetworkGatewayParams
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        params = read_params(NetworkGatewayParams, context.params)
-        self._delay = 0  # nothing is held back on the way up: the network takes its own time
+        params = self.settings
+        self._delay = 0  # statuses are not delayed, because the network already does that
         self._period = round(params.period / context.tick_s)
         self._tick_s = params.tick
-        # Ticks before a reference is due at which it is handed on: when the boards below begin to
-        # interpolate to it.
+        # Ticks before it is due at which a reference is passed down, because then the boards below
+        # begin to interpolate to it.
         self._ahead = self._period + LEAD_CYCLES * context.every
         self._above = "lan"
         self._arrived = JointReference.zeros(context.sizes)
-        self._refused = ""  # why the newest reference was not taken
-        self._their_s = 0.0  # simulated time there less that here
+        self._refused = ""  # why the newest reference was refused
+        self._their_s = 0.0  # simulated time of the other rack minus this rack's
 
     def process(self, tick: int) -> None:
-        """Hand references down, and statuses up."""
+        """Pass references down and statuses up; report the state of the other rack."""
         peer = self.peer.message
         self._follow(peer.ahead)
         super().process(tick)
         if peer.presence != Presence.THERE or peer.uncertainty < 0.0:
-            # Its references would not be followed, and its motion would begin without the arm.
+            # Its references could not be followed, so its motion must not begin.
             self.status.stopped = True
-            is_lost = peer.presence == Presence.LOST
-            self.status.reason = LOST if is_lost else NOT_COMPARED
+            self.status.reason = LOST if peer.presence == Presence.LOST else NOT_COMPARED
         elif self._refused:
             self.status.state = State.HOLDING
             self.status.reason = self._refused
@@ -207,8 +219,9 @@ class NetworkGateway(JointGateway):
             self.status.reason = program.reason
 
     def _follow(self, ahead_s: float) -> None:
-        """Take over the other rack's time while no reference is followed; later only approach it:
-        the clocks drift.
+        """Set the other rack's time while no reference is followed, else only approach it.
+
+        The clocks of the two racks drift.
         """
         apart_s = ahead_s - self._their_s
         if not self._due:
@@ -218,11 +231,11 @@ class NetworkGateway(JointGateway):
             self._their_s += step_s if apart_s > 0.0 else -step_s
 
     def _take(self, command: Reading[JointReference], tick: int) -> None:
-        """Hand on what is new when the boards below need it, at ticks of this rack."""
+        """Pass a new reference on when the boards below need it, with due ticks of this rack."""
         if command.is_new:
             arrived = self._arrived
             arrived.copy_from(command.message)
-            arrived.operator = 0  # of the other rack's operators, whose numbers mean nothing here
+            arrived.operator = 0  # serials of the other rack's operators have no meaning here
             self._refused = ""
             if arrived.due:
                 due_s = arrived.due * self._tick_s - self._their_s

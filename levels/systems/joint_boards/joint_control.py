@@ -1,6 +1,4 @@
-"""The law of a board that servoes joints of an arm: each by itself, with the inertia and load that
-it is given.
-"""
+"""The law of a board that servoes joints of an arm, each by itself with given inertia and load."""
 
 from __future__ import annotations
 
@@ -15,40 +13,42 @@ from rack.levels.robot.dynamics import FRICTION_SPEED, Dynamics, Payload
 from rack.levels.systems.joint_boards.messages import JointReference
 
 MOVED_RAD = 0.01
-"""Distance of a joint from where the loads were computed at which they are computed again; and
-beyond its range at which a position is a mistake, not rounding."""
+"""Motion of a joint after which loads are computed again. Also the distance beyond its range from
+which a commanded position is a mistake and not rounding."""
 AT = slice(0, 2)
 DUE = slice(2, 4)
-"""Rows of inertia, kg m2, and load, N m: at the beginning of an interval, and at its end."""
+"""Rows of inertia, kg m2, and load, N m, at the start of an interval and at its end."""
 
 
 class JointLoads:
-    """Inertia and load of every joint: interpolated between references; computed where there is
-    none.
+    """Inertia and load of every joint.
+
+    They are interpolated between references, and computed when there is none.
+
+    Attributes:
+        table: Rows `AT` and `DUE`, (4, joints).
     """
 
     def __init__(self, cell: Cell) -> None:
         joints = len(cell.dof)
-        self.table = np.zeros((4, joints))  # in the rows `AT` and `DUE`
+        self.table = np.zeros((4, joints))
         self._begin = self._due = 0  # tick
         self._payload = Payload(0.0, np.zeros(3))
         self._home = cell.home
         self._most = cell.bounds.torque
-        # What these torques accelerate as far as the arm may.
+        # Inertia that these torques just accelerate at the acceleration limits.
         self._most_inertia = self._most / cell.limits.acceleration
         low, high = cell.bounds.position.T
         self._low = low - MOVED_RAD
         self._high = high + MOVED_RAD
         self._dynamics = Dynamics(cell)
         self._still = np.zeros(joints)
-        # (joints,), rad; NaN: they are those of a reference.
+        # (joints,), rad. NaN if the loads come from a reference.
         self._computed_at = np.full(joints, np.nan)
 
     def misfit(self, command: JointReference) -> str:
-        """Return the field of a `JointReference` that asks for more than the arm can do; empty:
-        none does.
-        """
-        # Written so that NaN is too much.
+        """Return the field of a `JointReference` that asks for more than the arm can do, or ""."""
+        # Written so that NaN is rejected.
         within = {
             "position": (self._low <= command.position) & (command.position <= self._high),
             "inertia": (command.inertia > 0.0) & (command.inertia <= self._most_inertia),
@@ -58,7 +58,7 @@ class JointLoads:
         return next((name for name, fits in within.items() if not np.all(fits)), "")
 
     def _can_hold(self, command: JointReference) -> bool:
-        """Return whether the motors hold the arm at home with the payload of a reference."""
+        """Return True if the motors can hold the arm at home with the payload of a reference."""
         mass = command.payload_mass
         offset = command.payload_offset
         if mass == self._payload.mass and (offset == self._payload.offset).all():
@@ -67,7 +67,7 @@ class JointLoads:
         return bool(mass >= 0.0 and (np.abs(bias) <= self._most).all())
 
     def take(self, command: JointReference, tick: int) -> None:
-        """Go over to those of a `JointReference` that fits, until it is due."""
+        """Start an interval that ends with the loads of a `JointReference` when it is due."""
         self.table[AT] += self.part(tick) * (self.table[DUE] - self.table[AT])
         self.table[DUE] = command.inertia, command.load
         self._begin = tick
@@ -80,9 +80,7 @@ class JointLoads:
         return 1.0 if tick >= self._due else (tick - self._begin) / (self._due - self._begin)
 
     def hold(self, position: Array) -> None:
-        """Compute them for an arm at rest at `position`, (joints,), rad, unless they were computed
-        near it.
-        """
+        """Compute the loads of an arm at rest at `position`, (joints,), rad, if it has moved."""
         if (np.abs(position - self._computed_at) < MOVED_RAD).all():
             return
         inertia, bias = self._dynamics.terms(position, self._still, self._payload)
@@ -92,26 +90,39 @@ class JointLoads:
 
 @compiled_for("f8[:,::1], f8[:,::1], f8, f8, f8, f8[::1], f8[:,::1], f8[::1], f8[::1]")
 def servo_joints(
-    constants: Array,  # (5, joints): rows as below
-    loads: Array,  # (4, joints): inertia, load, at the beginning of an interval and at its end
-    part: float,  # of the interval that has passed
-    cycle_s: float,  # until the torque acts
-    age_s: float,  # of the sample, then
-    arm: Array,  # (2 joints,): sampled positions, rad, and velocities, rad/s
-    wanted: Array,  # (3, joints): rad, rad/s, rad/s2, now
-    torque: Array,  # (3 joints,): set: torques, N m, targets, rad, and their velocities, rad/s
-    status: Array,  # (4 joints,): set: positions, targets, their velocities, torques
+    constants: Array,  # (5, joints)
+    loads: Array,  # (4, joints), kg m2, N m, kg m2, N m
+    part: float,  # 0 to 1
+    cycle_s: float,
+    age_s: float,
+    arm: Array,  # (2 joints,), rad, rad/s
+    wanted: Array,  # (3, joints), rad, rad/s, rad/s2
+    torque: Array,  # (3 joints,), N m, rad, rad/s
+    status: Array,  # (4 joints,), rad, rad, rad/s, N m
 ) -> None:
-    """Set torques that make every joint's error that of a damped oscillator, from a sample taken on
-    to when they act.
+    """Set torques that make every joint's error decay like a damped oscillator.
 
     torque = inertia (qdd + 2 d w (qd_wanted - qd) + w^2 (q_wanted - q)) + load + dry friction
+
+    The sample is extrapolated to the time at which the torques act.
+
+    Args:
+        constants: Stiffness, damping, dry friction, torque limits, and 1 for each joint of this
+            board.
+        loads: Inertia and load at the start of an interval and at its end.
+        part: Part of the interval that has passed.
+        cycle_s: Time until the torques act.
+        age_s: Age of the sample at that time.
+        arm: Sampled positions and velocities.
+        wanted: Positions, velocities and accelerations to follow.
+        torque: Output: torques, targets and their velocities.
+        status: Output: positions, targets, their velocities, and torques.
     """
     stiffness = constants[0]  # 1/s2
     damping = constants[1]  # 1/s
     dry = constants[2]  # N m
     limits = constants[3]  # N m
-    driven = constants[4]  # 1: a joint of this board; 0: of another
+    driven = constants[4]  # 0 for joints of other boards
     joints = len(driven)
     for j in range(joints):
         status[j] = arm[j]

@@ -1,6 +1,4 @@
-"""The executor of a board that servoes some or all joints of an arm whose plant is on a board of
-its own.
-"""
+"""The executor of a board that servoes some or all joints of an arm on another board."""
 
 from __future__ import annotations
 
@@ -18,9 +16,9 @@ from rack.levels.operator import HOLDABLE, Goal, Operation, OperatorCommand
 from rack.levels.robot import dynamics
 from rack.levels.robot.cell import cell_of
 from rack.levels.servo import curves, reference
+from rack.levels.servo.arm_report import numbers
 from rack.levels.servo.control import Grip, LoopGains
 from rack.levels.servo.curves import Motion
-from rack.levels.servo.driver import numbers
 from rack.levels.servo.modification import ModifiableParams, misfits_of, names_of
 from rack.levels.servo.modified_law import LawInputs, ModifiedLaw
 from rack.levels.servo.operator_control import OperatorControl
@@ -42,18 +40,17 @@ class JointServoParams(ModifiableParams, LoopGains):
     """`[board.<name>.params]`: the joints that a board servoes, and the gains of their loop."""
 
     joints: tuple[str, ...] | None = None
-    """joints of `robot.joints` that it servoes; default: all"""
+    """joints of `robot.joints` that the board servoes; default: all"""
     gripper: bool = False
-    """true: it drives the gripper, too"""
+    """true if the board also drives the gripper"""
 
 
 class JointServo(Executor):
-    """Follows references with the torques of its own joints, and leaves the rest of the arm to
-    other boards.
+    """Follows references with the torques of some joints; other boards drive the others.
 
-    Set points are interpolated for all joints, so that all of them come to rest at the same time,
-    on whichever boards. While the arm is braked they begin where it is; while the arm says
-    `stopped`, they come to rest.
+    Set points are interpolated for all joints, so that all of them come to rest at the same time
+    even if different boards drive them. While the arm is braked, motion begins where it is. While
+    the arm reports `stopped`, the joints come to rest.
     """
 
     above = Input(JointReference, "above.command")
@@ -68,11 +65,12 @@ class JointServo(Executor):
         Operation.SET: (),
     }
     params = JointServoParams
+    settings: JointServoParams
     preloads = (curves, dynamics, reference, joint_control)
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        self._given = params = read_params(JointServoParams, context.params)
+        params = self.settings
         robot = context.robot
         cell = cell_of(context)
         names = robot.joints if params.joints is None else params.joints
@@ -89,32 +87,30 @@ class JointServo(Executor):
         self.operator_control = OperatorControl(
             self.commands, robot.joints, cell.limits.position, self._driven, obey=self._obey
         )
-        # What the law sets for its modifications.
+        # Output of the law when modifications call it.
         self._unmodified: Array = np.zeros(7 * len(robot.joints))
         self._grip = Grip(robot.gripper) if params.gripper and robot.gripper is not None else None
         below = max(pace.every for pace in context.below.values())
-        # Ticks, of a status: while its board stalls for less, the arm goes on with the last
-        # torques.
+        # Permitted age of a status in ticks. During shorter stalls of its board the arm keeps the
+        # last torques.
         self._oldest = below + cell.patience.ticks(below, context.tick_s)
-        self._sample: Array  # numbers of a status of the arm
-        self._shown_numbers: tuple[Array, ...] = ()  # of the messages to write
-        self._offered: JointReference | None = None  # reference whose loads are not yet taken
+        self._sample: Array  # positions and velocities in the status of the arm
+        self._shown_numbers: tuple[Array, ...] = ()  # numbers of the messages to write
+        self._offered: JointReference | None = None  # reference whose loads are not used yet
         self._command = self._rests_on = self._due = 0
-        self._refused = ""  # why the newest reference was not taken
-        self._met = False  # a status of the arm has come
+        self._refused = ""  # why the newest reference was refused
+        self._met = False  # a status of the arm has arrived
 
     @classmethod
     def names(cls, params: Mapping[str, Any]) -> Sequence[str]:
-        """Return the names of its control modifications."""
+        """Return the names of the control modifications."""
         return names_of(params)
 
     @classmethod
     def misfits(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Misfits:
-        """Yield joints that the arm lacks or that are named twice, an idle board, and modifications
-        that do not fit.
-        """
+        """Yield invalid joints, a board without work, and modifications that do not suit it."""
         params = read_params(JointServoParams, context.params)
         known = context.robot.joints
         named = known if params.joints is None else params.joints
@@ -141,18 +137,17 @@ class JointServo(Executor):
         every = self.context.every
         reference = self.reference
         operator = self.operator_control
-        away = self.below.is_lost or tick - sampled > self._oldest
-        stopped = away or arm.stopped
-        if away or (stopped and arm.braked):
+        is_silent = self.below.is_lost or tick - sampled > self._oldest
+        stopped = is_silent or arm.stopped
+        if is_silent or (stopped and arm.braked):
             reference.start(arm.position, arm.velocity, tick)
             self._modified.interrupt()
         if stopped:
             wanted = reference.rest(tick)
         else:
             wanted = operator.wanted(reference, tick) if operator.stands else reference.at(tick)
-        # Take over inertia and load of the reference that is followed; compute them while
-        # none is.
-        if stopped or operator.stands or self.reference.holding:
+        # Use inertia and load of the reference that is followed. Compute them if there is none.
+        if stopped or operator.stands or reference.holding:
             self.loads.hold(arm.position)
         elif self._offered is not None:
             self.loads.take(self._offered, tick)
@@ -170,38 +165,45 @@ class JointServo(Executor):
         if self._grip is not None:
             torque.grip_force = self._grip.force(arm.opening, arm.opening_velocity)
         torque.operator = operator.orders.rests_on(self._rests_on)
-        self._report(self.status, arm, away, stopped)
+        self._report(self.status, arm, is_silent, stopped)
         operator.orders.report(self.status, self._rests_on)
 
     def _obey(self, command: OperatorCommand) -> str:
-        """Modify the law, or set a live parameter; return why not, empty: it is done."""
+        """Switch a modification or set a parameter. Return why it is refused, or an empty text."""
         if command.what == Operation.MODIFY:
             return self._modified.switch(command.name, command.goal == Goal.ON)
-        self._given, why = set_live(self._given, command.name)
-        self._given.fill(self._constants)
-        return why
+        self.settings, refusal = set_live(self.settings, command.name)
+        self.settings.fill(self._constants)
+        return refusal
 
     def _modify(self, times: tuple[float, float, float], wanted: Motion, tick: int) -> None:
-        """Replace the torques just set by those of the modified law."""
+        """Replace the torques just computed with the torques of the modified law.
+
+        Args:
+            times: Passed part of the interval, time until the torques act, and age of the sample,
+                s.
+            wanted: Motion to follow.
+            tick: Tick of the cycle.
+        """
         joints = len(self._driven)
         table = self.loads.table
-        part = times[0]
-        given, shown = self._shown_numbers
+        command, shown_status = self._shown_numbers
         torque = self._unmodified[: 3 * joints]
         status = self._unmodified[3 * joints :]
 
-        def law(motion: Motion, state: Array) -> Array:
+        def compute_unmodified(motion: Motion, state: Array) -> Array:
+            """Return the torques of the unmodified law for a motion at a state."""
             self._servo(*times, state.reshape(-1), motion.table, torque, status)
             return torque[:joints]
 
-        inertia, load = table[AT] + part * (table[DUE] - table[AT])
+        inertia, load = table[AT] + times[0] * (table[DUE] - table[AT])
         inputs = LawInputs(wanted, self._sample.reshape(2, joints), inertia, load, tick)
-        modified = self._modified.torque(law, inputs)
-        np.copyto(given[:joints], modified, where=self._driven)
-        np.copyto(shown[3 * joints :], modified, where=self._driven)
+        modified = self._modified.torque(compute_unmodified, inputs)
+        np.copyto(command[:joints], modified, where=self._driven)
+        np.copyto(shown_status[3 * joints :], modified, where=self._driven)
 
     def _meet(self, is_there: bool, arm: ArmStatus) -> bool:
-        """Begin with the first status of the arm; return whether there is one."""
+        """Prepare for the first status of the arm. Return False while there is none."""
         status = self.status
         torque = self.command
         self._met = is_there
@@ -221,7 +223,7 @@ class JointServo(Executor):
         return True
 
     def _take_messages(self) -> None:
-        """Take over what is new."""
+        """Process a new command of the operator and a new reference."""
         if self.operator.is_new:
             self.operator_control.take(self.operator, self.below.message.position)
         if self.above.is_new:
@@ -230,7 +232,7 @@ class JointServo(Executor):
             self._rests_on = command.operator
             self._refused = ""
             if misfit := self.loads.misfit(command):
-                # Before there is a set point, all is zero.
+                # Before the first set point all fields are zero, which is no mistake.
                 if command.due:
                     self._refused = f"rejected: a reference whose {misfit} is out of range"
                 return
@@ -241,16 +243,23 @@ class JointServo(Executor):
                 self.command.payload_mass = command.payload_mass
                 self.command.payload_offset = command.payload_offset
 
-    def _report(self, status: JointStatus, arm: ArmStatus, away: bool, stopped: bool) -> None:
-        """Fill what the law has not set in the status."""
+    def _report(self, status: JointStatus, arm: ArmStatus, is_silent: bool, stopped: bool) -> None:
+        """Fill the fields of the status that the law does not set.
+
+        Args:
+            status: Status to write.
+            arm: Status of the arm.
+            is_silent: The status of the arm is missing or too old.
+            stopped: The joints must come to rest.
+        """
         operator = self.operator_control
         holding = self.reference.holding
-        kept = operator.reason
+        reason = operator.reason
         error = Error.NONE
-        if away:
-            kept = ARM_LOST
+        if is_silent:
+            reason = ARM_LOST
         elif stopped:
-            kept = f"arm: {arm.reason}"
+            reason = f"arm: {arm.reason}"
             if arm.state == State.ERROR:
                 error = Error(arm.error)
         status.driven = self._driven
@@ -258,10 +267,10 @@ class JointServo(Executor):
         status.holding = holding
         status.stopped = stopped or operator.stands
         status.due = self._due
-        status.reason = kept or self._refused or self._modified.reason
+        status.reason = reason or self._refused or self._modified.reason
         status.error = error
         if error:
             status.state = State.ERROR
         else:
             resting = State.IDLE if holding else State.EXECUTING
-            status.state = State.HOLDING if kept and self._command else resting
+            status.state = State.HOLDING if reason and self._command else resting

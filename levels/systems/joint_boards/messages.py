@@ -1,19 +1,21 @@
 """The messages between a trajectory level, the boards that servo joints, and the board of the arm.
 
-Every vector has all joints of the arm; a board of some joints fills and obeys its own. Symbolic
-sizes as in `rack.levels.messages`.
+Every vector has all joints of the arm; a board of some joints fills and obeys the entries of its
+joints. Symbolic sizes are defined in `rack.levels.messages`.
 
-A level of your own that servoes joints
-- names them in its parameter `joints` (without one: all), and says with `gripper = true` that it
-  drives the gripper.
-- writes a `JointTorque` in every cycle, for the moment when it acts: a cycle after the release.
-  `sampled` shows the arm which of its statuses the torque rests on; one that is too old brakes it.
-- wants its joints where they are while the arm says `braked`: only then is it released. While it
-  only says `stopped`, brings them to rest and holds them; an arm that still moves after the time
-  that this takes is braked.
+Your own level that servoes joints:
 
-A level of your own above these reports no set point (`due = 0`) while one of them is `stopped`, and
-begins again where they hold the arm.
+- names them in its parameter `joints` (default: all), and sets `gripper = true` if it drives the
+  gripper.
+- writes a `JointTorque` in every cycle, for the time when it acts: one cycle after the release.
+  `sampled` shows the arm on which of its statuses the torque is based; a torque based on a status
+  that is too old brakes the arm.
+- wants its joints where they are while the arm reports `braked`; only then are the brakes released.
+  While the arm only reports `stopped`, the level brings the joints to rest and holds them. An arm
+  that still moves after the time that this takes is braked.
+
+Your own level above these writes no set point (`due = 0`) while one of them is `stopped`, and
+starts again where they hold the arm.
 """
 
 from __future__ import annotations
@@ -26,12 +28,10 @@ from rack.levels.operator import AnsweringStatus, RelayedCommand, SampledCommand
 
 
 class JointReference(RelayedCommand, version=1):
-    """From the trajectory level to all boards that servo joints; these interpolate between its set
-    points.
-    """
+    """Sent by the trajectory level to all boards that servo joints, which interpolate it."""
 
     due: int = field(
-        unit="tick", doc="tick at which the arm should be there; 0: no set point, hold"
+        unit="tick", doc="tick at which the arm should be at the set point, or 0 to hold"
     )
     position: ndarray = per_joint("rad", "joint positions")
     velocity: ndarray = per_joint("rad/s", "joint velocities")
@@ -47,13 +47,14 @@ class JointReference(RelayedCommand, version=1):
 
 
 class JointTorque(SampledCommand, version=1):
-    """From a board that servoes joints to the board of the arm, which adds them up; id rises with
-    every
-    cycle.
+    """Sent by a board that servoes joints to the board of the arm, which adds them up.
+
+    The id rises with every cycle.
     """
 
     sampled: int = field(
-        unit="tick", doc="tick of the arm's status that it rests on; -1: none yet, so no torque"
+        unit="tick",
+        doc="tick of the arm's status on which the torque is based, or -1 before the first",
     )
     torque: ndarray = per_joint("N m", "of the board's own joints; others 0")
     target: ndarray = per_joint(
@@ -70,7 +71,7 @@ class JointTorque(SampledCommand, version=1):
 
 
 class JointStatus(AnsweringStatus, version=1):
-    """From a board that servoes joints to the trajectory level."""
+    """Sent by a board that servoes joints to the trajectory level."""
 
     position: ndarray = per_joint("rad", "joint positions, from the arm's status")
     target: ndarray = per_joint(
@@ -83,7 +84,7 @@ class JointStatus(AnsweringStatus, version=1):
     )
     holding: bool = field(doc="1: no fresh set point, the joints ramp to rest and stay")
     stopped: bool = field(doc="1: set points are not followed: an operator, or the arm is braked")
-    due: int = field(unit="tick", doc="newest set point taken over; 0: none")
+    due: int = field(unit="tick", doc="due tick of the newest set point taken over, or 0")
 
 
 class SensedStatus(AnsweringStatus):
@@ -93,8 +94,9 @@ class SensedStatus(AnsweringStatus):
 
 
 class ArmStatus(SensedStatus, DrivenArm, version=2):
-    """From the board of the arm to those that servo joints; a servo level's status without set
-    points of its own.
+    """Sent by the board of the arm to the boards that servo joints.
+
+    It is the status of a servo level without set points.
     """
 
 

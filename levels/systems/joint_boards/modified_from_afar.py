@@ -1,7 +1,7 @@
-"""Control modifications that another rack puts into servo laws, and takes out, over a network.
+"""Control modifications that another rack switches in servo laws over a network.
 
-The message says which are to be in, not what has changed, so none that is lost or overtaken is
-missed. While the other rack is lost, they stay as they are.
+The message contains the modifications that must be active, not what has changed, so a message that
+is lost or overtaken does no harm. While the other rack is lost, modifications stay as they are.
 """
 
 from __future__ import annotations
@@ -15,29 +15,31 @@ from rack.backplane.message import Command, State, Status, field
 from rack.levels.level import Executor, Input, Inputs, LevelContext, Output
 from rack.levels.operator import AnsweringStatus, Goal, Operation, OperatorCommand, Orders
 from rack.levels.systems.joint_boards.joint_servo import JointServo
-from rack.levels.tables import Table, read_params
+from rack.levels.tables import Table
 
 NAME_BYTES = 40
+"""Length of a name in a message, including a space."""
 MOST_NAMES = 8
-"""Names that one message holds, and the length of each with a space."""
+"""Maximum number of names in a message."""
 ANSWER_CYCLES = 20
-"""Cycles of a joint's board from answer to answer: at 1 kHz as often as a network permits."""
+"""Cycles of a joint's board from answer to answer, which at 1 kHz suits a network."""
 
 
 class Modifications(Command, version=1):
-    """The control modifications that are to be in force."""
+    """The control modifications that must be active."""
 
     wanted: str = field(
-        f"S{MOST_NAMES * NAME_BYTES}", doc="those that are to be in, as in elbow.pd, by spaces"
+        f"S{MOST_NAMES * NAME_BYTES}",
+        doc="modifications that must be active, such as elbow.pd, separated by spaces",
     )
 
 
 class ModifiedAnswer(Status, version=1, message="modified"):
-    """A board's answer: which message it has obeyed, or why it could not."""
+    """A board's answer: the message that it has obeyed, or why it could not."""
 
 
 class ModifierStatus(AnsweringStatus, version=1):
-    """Status of the board that puts in modifications."""
+    """Status of the board that sends modifications."""
 
 
 BoardAndName = Annotated[
@@ -47,16 +49,17 @@ BoardAndName = Annotated[
 
 
 class SenderParams(Table):
-    """`[board.<name>.params]`: what an operator may put in."""
+    """`[board.<name>.params]`: the modifications that an operator may switch."""
 
     known: tuple[BoardAndName, ...] = Field(min_length=1, max_length=MOST_NAMES)
     """modifications as board.name, of boards of the other rack"""
 
 
 class ModificationSender(Executor):
-    """Sends an operator's modifications to boards of another rack; done is what all have answered.
+    """Sends an operator's modifications to boards of another rack.
 
-    A restarted board gets all of its operator's commands again, in order, and comes to the same.
+    A command is done when all boards have answered. A restarted board gets all commands of its
+    operator again, in order, and so restores its state.
     """
 
     modified = Inputs(ModifiedAnswer, "lan.modified")
@@ -65,10 +68,11 @@ class ModificationSender(Executor):
     status = Output(ModifierStatus)
     commands = {Operation.MODIFY: (Goal.ON, Goal.OFF)}
     params = SenderParams
+    settings: SenderParams
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        self._known = read_params(SenderParams, context.params).known
+        self._known = self.settings.known
         self._wanted: set[str] = set()
         self._orders = Orders(self.commands)
         self._pending: list[int] = []  # serials of commands that not all boards have answered
@@ -76,11 +80,11 @@ class ModificationSender(Executor):
     @classmethod
     def names(cls, params: Mapping[str, Any]) -> Sequence[str]:
         """Return the names of the modifications."""
-        found = params.get("known")
-        return tuple(map(str, found)) if isinstance(found, Sequence) else ()
+        known = params.get("known")
+        return tuple(map(str, known)) if isinstance(known, Sequence) else ()
 
     def process(self, tick: int) -> None:
-        """Send what is to be in, and report whether it is."""
+        """Send the modifications that must be active, and report whether they are."""
         self._orders.take(self.operator, judge=self._obey)
         self.command.id = self._orders.serial
         self.command.wanted = " ".join(sorted(self._wanted))
@@ -100,6 +104,7 @@ class ModificationSender(Executor):
         self._orders.report(status)
 
     def _obey(self, command: OperatorCommand) -> None:
+        """Switch a modification, or refuse a name that is not known."""
         if command.name not in self._known:
             self._orders.refuse(
                 f"no modification '{command.name}'; permitted: {', '.join(self._known)}"
@@ -111,30 +116,30 @@ class ModificationSender(Executor):
 
 
 class ModifiedFromAfar(JointServo):
-    """Servoes joints by a law that another rack, and an operator here, may modify."""
+    """Servoes joints by a law that another rack, and an operator of this rack, may modify."""
 
     asked = Input(Modifications, "lan.modifications")
     modified = Output(ModifiedAnswer, cycles=ANSWER_CYCLES)
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        self._asked: set[str] = set()  # own modifications that are to be in
+        self._asked: set[str] = set()  # modifications of this board that must be active
 
     def process(self, tick: int) -> None:
-        """Modify the law as asked, and go on."""
+        """Switch modifications as requested, then do the cycle."""
         if self.asked.is_new:
-            own = f"{self.context.board}."
+            prefix = f"{self.context.board}."
             wanted = {
-                name.removeprefix(own)
+                name.removeprefix(prefix)
                 for name in self.asked.message.wanted.split()
-                if name.startswith(own)
+                if name.startswith(prefix)
             }
             refused = {
-                name: why
+                name: refusal
                 for name in sorted(wanted ^ self._asked)
-                if (why := self._modified.switch(name, name in wanted))
+                if (refusal := self._modified.switch(name, name in wanted))
             }
-            # Those refused are asked for in every message, and each answer says so.
+            # Refused ones are requested in every message, and every answer reports the refusal.
             self._asked = wanted.difference(refused)
             self.modified.echo = self.asked.message.id
             self.modified.error = len(refused)

@@ -1,5 +1,4 @@
-"""The elemental move level with the real levels below it: paths planned ahead, detours,
-restarts."""
+"""The elemental move level with the real levels below it: planning ahead and detours."""
 
 from __future__ import annotations
 
@@ -27,7 +26,7 @@ def post_moves(
 
 
 @pytest.mark.slow
-def test_block_is_put_where_it_should_be_and_the_arm_hardly_waits_for_a_path() -> None:
+def test_a_block_is_placed_at_its_goal_and_the_arm_hardly_waits_for_paths() -> None:
     rack = WholeRack(actions=[TRANSFER, HOME])
     seen: list[tuple[int, bool]] = []
 
@@ -53,7 +52,7 @@ def test_block_is_put_where_it_should_be_and_the_arm_hardly_waits_for_a_path() -
 
 
 @pytest.mark.slow
-def test_another_path_is_taken_around_an_obstacle_that_comes_into_the_way() -> None:
+def test_another_path_avoids_an_obstacle_that_moves_into_the_way() -> None:
     rack = WholeRack(
         arm="puma560_crossing", actions=[TRANSFER], motion=post_moves((5.5, (0.6, 0.0, 0.9)))
     )

@@ -1,5 +1,4 @@
-"""The executor of the elemental move level alone; the test plays task level, planner and primitive
-level."""
+"""The executor of the elemental move level alone; the test plays the levels around it."""
 
 from __future__ import annotations
 
@@ -23,7 +22,7 @@ PICK = (Verb.MOVE, Verb.APPROACH, Verb.GRASP, Verb.DEPART, Verb.MOVE)
 
 
 class Bench(Lockstep):
-    """The executor between mailboxes that the test writes."""
+    """The executor with mailboxes that the test writes."""
 
     def __init__(self, **params: Any) -> None:
         places = {"above": "task", "below": "primitive"}
@@ -65,7 +64,7 @@ class Bench(Lockstep):
         replan: int = 0,
         error: Error = Error.NONE,
     ) -> None:
-        """Publish a path for a move, from where the one before it ends or `start`, or a refusal."""
+        """Publish a path for a move, from `start` or the end of the path before, or a refusal."""
         plan = self.message("elemental_move.plan")
         plan.move, plan.replan, plan.kind, plan.error = move, replan, SegmentKind.PATH, error
         plan.reason = "something is there" if error else ""
@@ -169,7 +168,7 @@ def test_request_is_dropped_when_the_way_is_free_again() -> None:
     assert bench.segments() == [(1, 1), (2, 2)]
 
 
-def test_other_path_replaces_the_blocked_one_and_withdraws_what_followed() -> None:
+def test_another_path_replaces_the_blocked_one_and_withdraws_later_segments() -> None:
     bench = planned_bench(replans=1)
     bench.cycle(2, current=1, blocked=1, position=bench.home + 0.05)
     assert (bench.command.hold, bench.status.replan > 0) == (1, True)
@@ -187,7 +186,7 @@ def test_other_path_replaces_the_blocked_one_and_withdraws_what_followed() -> No
     assert (bench.status.error, bench.status.replan > 0) == (Error.NONE, True)
 
 
-def test_way_that_stays_blocked_is_an_error_after_so_many_paths_and_names_what_is_there() -> None:
+def test_a_path_that_stays_blocked_is_an_error_that_names_the_obstacle() -> None:
     # As where the guard sees a collision that the planner does not: every path is free, and none
     # can be followed.
     bench, why = (
@@ -205,7 +204,7 @@ def test_way_that_stays_blocked_is_an_error_after_so_many_paths_and_names_what_i
     assert bench.segments() == []
 
 
-def test_time_is_handed_down_less_what_the_answer_takes() -> None:
+def test_a_deadline_is_handed_down_minus_the_time_of_the_answer() -> None:
     bench = Bench()
     bench.order([Verb.MOVE_JOINTS], by=20.0)
     bench.plan(1)
@@ -215,7 +214,7 @@ def test_time_is_handed_down_less_what_the_answer_takes() -> None:
     assert 18.0 < bench.command.segments[0]["by"] <= 20.0 - 2 * 0.25
 
 
-def test_refusal_counts_when_its_move_is_due_and_not_before() -> None:
+def test_a_refusal_is_an_error_only_when_its_move_is_due() -> None:
     bench = Bench()
     bench.order()
     bench.plan(1)
@@ -244,7 +243,9 @@ def test_restarted_executor_continues_from_its_own_last_messages() -> None:
     ("mailbox", "reason", "hold"),
     [("task.command", ABOVE_LOST, 1), ("primitive.status", BELOW_LOST, 0)],
 )
-def test_loss_of_a_neighbour_is_said_and_ends(mailbox: str, reason: str, hold: int) -> None:
+def test_the_loss_of_a_neighbour_is_reported_until_it_ends(
+    mailbox: str, reason: str, hold: int
+) -> None:
     bench = planned_bench()
     bench.boxes[mailbox].lost = True
     bench.cycle(2)

@@ -68,7 +68,7 @@ def test_clearance_decides_near_the_table_and_may_be_lowered(
     assert checker.room(q) == pytest.approx(0.010, abs=1e-4)
 
 
-def test_gripper_may_come_to_the_block_that_is_meant_and_to_no_other(
+def test_the_gripper_may_only_touch_the_intended_block(
     puma: Cell, ik: InverseKinematics, checker: CollisionChecker
 ) -> None:
     q = at(ik, puma, 0.5, 0.3, 0.475)
@@ -98,7 +98,7 @@ def test_held_block_is_carried_and_keeps_clear_of_the_wall(
     assert checker.free(q)
 
 
-def test_held_block_may_touch_the_table_only_where_it_is_meant_and_not_sink_into_it(
+def test_a_held_block_may_touch_the_table_only_if_intended_and_not_sink_into_it(
     puma: Cell, ik: InverseKinematics, checker: CollisionChecker
 ) -> None:
     checker.hold(BLOCK1)
@@ -123,9 +123,7 @@ def test_objects_are_where_they_are_placed(
 
 
 @pytest.mark.parametrize("held", [None, BLOCK1])
-def test_compiled_checks_decide_as_python_does_and_are_loaded_before(
-    puma: Cell, held: int | None
-) -> None:
+def test_compiled_checks_agree_with_python_and_are_preloaded(puma: Cell, held: int | None) -> None:
     preload(collision)
     loaded = list(first_blocked.load().signatures)  # type: ignore[attr-defined]
     checker, under_python = (CollisionChecker(puma, config("puma560")[1]) for _ in range(2))
@@ -142,7 +140,7 @@ def test_compiled_checks_decide_as_python_does_and_are_loaded_before(
     assert list(first_blocked.load().signatures) == loaded  # type: ignore[attr-defined]
 
 
-def test_a_pair_that_is_too_close_counts_though_its_bodies_have_several_geoms(puma: Cell) -> None:
+def test_a_close_pair_counts_even_if_its_bodies_have_several_geoms(puma: Cell) -> None:
     # Of bodies with several geoms MuJoCo's middle phase rules pairs out by margins of its own.
     usual, thorough = (CollisionChecker(puma, config("puma560")[1], 1e-3) for _ in range(2))
     thorough._model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)
@@ -152,7 +150,7 @@ def test_a_pair_that_is_too_close_counts_though_its_bodies_have_several_geoms(pu
 
 
 @pytest.mark.parametrize("held", [None, BLOCK1])
-def test_pairs_that_mujoco_leaves_out_would_change_no_answer(puma: Cell, held: int | None) -> None:
+def test_pairs_that_mujoco_skips_do_not_change_the_result(puma: Cell, held: int | None) -> None:
     checker, with_all = (CollisionChecker(puma, config("puma560")[1], 1e-3) for _ in range(2))
     for one in (checker, with_all):
         one.hold(held, (0.0, 0.0, 0.02), (0.0, 1.0, 0.0, 0.0))

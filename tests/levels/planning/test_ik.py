@@ -1,4 +1,4 @@
-"""Inverse kinematics: of the PUMA, of an arm with seven joints, and straight lines of the tool."""
+"""Inverse kinematics of the PUMA and of an arm with seven joints, and straight lines."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def random_poses(name: str, count: int) -> list[Pose]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CELLS)
-def test_every_pose_that_some_configuration_has_is_reached_within_the_limits(name: str) -> None:
+def test_every_pose_of_a_valid_configuration_is_reached_within_the_limits(name: str) -> None:
     ik, limits = SOLVERS[name], CELLS[name].limits.position
     for target in random_poses(name, 40):
         found = ik.reachable(target, CELLS[name].home)
@@ -38,7 +38,7 @@ def test_every_pose_that_some_configuration_has_is_reached_within_the_limits(nam
             assert np.all(q <= limits[:, 1])
 
 
-def test_solutions_are_distinct_and_the_quickest_to_get_to_comes_first() -> None:
+def test_solutions_are_distinct_and_the_quickest_to_reach_is_first() -> None:
     ik, home = SOLVERS["puma560"], CELLS["puma560"].home
     found = ik.reachable(pose((0.5, -0.2, 0.7), DOWN), home)
     assert len(found) >= 2
@@ -51,7 +51,7 @@ def test_solutions_are_distinct_and_the_quickest_to_get_to_comes_first() -> None
     assert not any(np.allclose(q, found[0]) for q in kept)
 
 
-def test_what_is_out_of_reach_has_no_solution_and_no_line() -> None:
+def test_a_pose_out_of_reach_has_no_solution_and_no_line() -> None:
     ik, home = SOLVERS["puma560"], CELLS["puma560"].home
     assert ik.reachable(pose((2.0, 0.0, 0.5), DOWN), home) == []
     away = ik.tool_at(home).position + np.array([1.0, 0.0, 0.0])

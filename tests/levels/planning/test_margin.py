@@ -1,5 +1,4 @@
-"""Planning keeps a margin where the simulated arm's checks have none: between links, from supports,
-below closing fingers."""
+"""Planning keeps a margin that the checks of the simulated arm do not have."""
 
 from __future__ import annotations
 
@@ -37,7 +36,7 @@ def hinged(folder: Path, apart: float) -> tuple[Cell, SceneConfig]:
     return build_cell(robot, SceneConfig(), CLOCK_NS), SceneConfig()
 
 
-def test_links_keep_the_margin_in_planning_alone(tmp_path: Path) -> None:
+def test_links_keep_the_margin_only_in_planning(tmp_path: Path) -> None:
     made, scene = hinged(tmp_path, 0.004)
     lifted = np.array([-0.0032 / 0.2, 0.5])  # 0.8 mm are left
     assert CollisionChecker(made, scene).free(lifted)
@@ -71,7 +70,7 @@ def test_a_grasp_leaves_room_for_fingers_that_reach_farther_as_they_close(
 
 
 JAW_M = 0.025
-"""From the tool of `grippers.one_finger` to its jaw, on the side of negative y."""
+"""Distance from the tool of `grippers.one_finger` to its jaw, on the negative y side."""
 
 
 def jaw_of(made: Cell) -> FixedJaw | None:
@@ -84,7 +83,7 @@ def one_finger(folder: Path) -> Cell:
 
 
 @pytest.mark.parametrize("half", [0.01, 0.02, 0.03])
-def test_the_jaw_comes_next_to_an_object_of_any_width(tmp_path: Path, half: float) -> None:
+def test_the_jaw_is_placed_next_to_an_object_of_any_width(tmp_path: Path, half: float) -> None:
     made = one_finger(tmp_path)
     geom = made.model.body_geomadr[made.bodies[0]]
     made.model.geom_size[geom] = half
@@ -96,7 +95,7 @@ def test_the_jaw_comes_next_to_an_object_of_any_width(tmp_path: Path, half: floa
     assert moved.position == pytest.approx([0.0, JAW_M - half - GAP_M, 0.0], abs=2e-4)
 
 
-def test_an_object_that_the_jaw_cannot_meet_is_taken_around_the_tool(tmp_path: Path) -> None:
+def test_an_object_that_the_jaw_cannot_meet_does_not_move_the_tool(tmp_path: Path) -> None:
     made = one_finger(tmp_path)
     jaw = jaw_of(made)
     assert jaw is not None

@@ -69,7 +69,7 @@ def test_path_around_the_wall_is_free_between_its_checks_too(
 
 
 @pytest.mark.slow
-def test_equal_questions_get_equal_paths_whatever_was_planned_before(
+def test_equal_requests_get_equal_paths_whatever_was_planned_before(
     puma: Cell, checker: CollisionChecker, around: Path, sides: tuple[np.ndarray, np.ndarray]
 ) -> None:
     fresh = PathPlanner(puma, SCENE.clearance, SEED)
@@ -114,7 +114,7 @@ def test_blend_shrinks_to_a_stop_where_the_inside_of_the_corner_is_blocked(
     assert planner.rounded(corner, len).blend[1] > 0.5
 
 
-def test_search_leaves_nothing_in_memory(
+def test_a_search_frees_its_memory(
     planner: PathPlanner, sides: tuple[np.ndarray, np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     alive = []

@@ -22,7 +22,7 @@ BLOCK1, PEG = 0, 2
 
 
 def weighing(kilograms: float) -> Cell:
-    """Return the PUMA's cell with another mass of block1."""
+    """Return the cell of the PUMA with another mass for block1."""
     made = cell("puma560")
     made.model.body_subtreemass[made.bodies[BLOCK1]] = kilograms
     return made
@@ -34,7 +34,7 @@ def situation_of(made: Cell) -> Situation:
 
 
 def grip_of(made: Cell, row: int) -> Pose:
-    """Return how the first grasp of an object holds it."""
+    """Return the grip of the first grasp of an object."""
     at = situation_of(made)
     return next(iter(grasps(made, at, row)))[0].inverse() @ at.object_pose(row)
 
@@ -77,7 +77,7 @@ def test_grip_of_a_linkage_follows_from_its_gear(tmp_path: Path) -> None:
     assert holds == pytest.approx(2 * 1.2 / (0.05 * np.cos(np.pi / 6)), rel=0.01)
 
 
-def test_any_move_with_what_is_held_is_weighed_an_operators_goto_too() -> None:
+def test_every_move_with_a_held_object_is_checked_for_its_weight() -> None:
     made = weighing(40.0)
     move = Move(
         1,

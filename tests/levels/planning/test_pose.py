@@ -1,4 +1,4 @@
-"""Poses: composition, straight ways, orientations by direction."""
+"""Poses: composition, interpolation and orientations from directions."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ def rotated(vector: list[float], quaternion: np.ndarray) -> np.ndarray:
     return result
 
 
-def test_a_pose_times_its_inverse_is_where_it_began() -> None:
+def test_a_pose_times_its_inverse_is_the_identity() -> None:
     rng = np.random.default_rng(1)
     for _ in range(20):
         a, b = random_pose(rng), random_pose(rng)
         assert (a @ (a.inverse() @ b)).is_near(b)
 
 
-def test_way_between_poses_is_straight_and_turns_at_a_constant_rate() -> None:
+def test_interpolation_between_poses_is_straight_with_a_constant_turn_rate() -> None:
     rng = np.random.default_rng(2)
     a, b = random_pose(rng), random_pose(rng)
     whole = a.angle_to(b)

@@ -1,5 +1,4 @@
-"""A rack of servo, world model and primitive level in one process; the test commands it in place of
-the level above."""
+"""A rack of servo, world model and primitive level in one process, commanded by the test."""
 
 from __future__ import annotations
 
@@ -21,7 +20,7 @@ Segment = Mapping[str, Any]
 
 TURN = np.array([0.6, -0.1, 0.2, 0.0, 0.1, 0.3])
 BEND = np.array([0.3, 0.0, 0.0, 0.4, 0.0, -0.3])
-"""Two ways from home, rad."""
+"""Two displacements from home, rad."""
 
 
 class PrimitiveRack(Lockstep):
@@ -83,7 +82,7 @@ class PrimitiveRack(Lockstep):
         return self.read("servo.status")
 
     def run_until_done(self, segment: int, seconds: float = 10.0) -> bool:
-        """Run until `segment` is done; say whether it was within simulated `seconds`."""
+        """Run until `segment` is done. Return False if that takes more than `seconds`."""
         return self.run(seconds, until=lambda rack: rack.read("primitive.status").done >= segment)
 
     def run_until_error(self, seconds: float = 4.0) -> Any:
@@ -95,7 +94,7 @@ class PrimitiveRack(Lockstep):
 def path(
     serial: int, waypoints: ArrayLike, blend: ArrayLike | None = None, **fields: Any
 ) -> Segment:
-    """Return a PATH segment; without `blend` every corner is a stop."""
+    """Return a PATH segment. Without `blend` the arm stops at every corner."""
     points = np.array(waypoints)
     blends = np.zeros(len(points)) if blend is None else blend
     segment = {"id": serial, "kind": SegmentKind.PATH, "object": -1, "count": len(points)}

@@ -1,4 +1,4 @@
-"""The guard: the arm rests before it touches an obstacle, and continues when the way is clear."""
+"""The path guard: the arm rests before it touches an obstacle, and continues when it is gone."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SWEEP = np.array([2.2, 0.0, 0.0, 0.0, 0.0, 0.0])
 
 
 def crossing(at: float, y: float = 0.0, leaves_at: float | None = None) -> list[MotionConfig]:
-    """The post waits next to the sweep, steps into it at `at`, and may leave again."""
+    """Return a motion of the post: it waits, enters the path of the arm at `at`, and may leave."""
     beside, inside = (0.85, y, 0.8), (0.55, y, 0.8)
     moves = [(0.0, beside, 5.0), (at, inside, 0.25)] + (
         [(leaves_at, beside, 0.25)] if leaves_at else []
@@ -59,7 +59,7 @@ def test_arm_rests_before_an_obstacle_that_crosses_touches_it() -> None:
 
 
 @pytest.mark.slow
-def test_blocked_arm_says_when_the_way_is_free_again_and_continues() -> None:
+def test_a_blocked_arm_continues_when_the_obstacle_has_left() -> None:
     rack = PrimitiveRack(CROSSING, motion=crossing(1.4, leaves_at=4.0))
     sweep(rack)
     rack.run(3.0)
@@ -82,7 +82,7 @@ def test_blocked_arm_says_when_the_way_is_free_again_and_continues() -> None:
 
 
 class Watched:
-    """A guard over a path of the crossing cell, and the world model that it is shown."""
+    """A guard of a path in the crossing cell, with its world model."""
 
     def __init__(self, waypoints: np.ndarray, held: int = -1) -> None:
         _, scene = arms.config(CROSSING)
@@ -103,7 +103,7 @@ class Watched:
         self.guard.watch(self.segment, self.path, 0.04, self.world)
 
     def clear(self, time_s: float = 0.0, cycles: int = 60) -> bool:
-        """Return whether the way stays clear over `cycles` in which nothing moves."""
+        """Return True if the path stays clear for `cycles` in which nothing moves."""
         answers = [
             self.guard.is_clear(self.path, self.trajectory, time_s, self.world)
             for _ in range(cycles)
@@ -126,7 +126,7 @@ def test_resting_obstacle_anywhere_on_the_path_is_found() -> None:
         assert not watched.clear()
 
 
-def test_obstacle_on_its_way_into_the_path_is_seen_before_it_is_there() -> None:
+def test_an_obstacle_that_moves_into_the_path_is_found_before_it_arrives() -> None:
     watched = Watched(np.array([NEAR, NEAR + SWEEP]))
     watched.watch()
     arrival_s = 0.6 * watched.trajectory.duration

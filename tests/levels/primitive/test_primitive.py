@@ -16,7 +16,7 @@ def positions(rack: PrimitiveRack) -> np.ndarray:
 
 
 def first(rack: PrimitiveRack, **wanted: int) -> int:
-    """Return the index of the first status whose fields are as wanted."""
+    """Return the index of the first status with the given fields."""
     return next(
         k
         for k, s in enumerate(rack.seen)
@@ -26,7 +26,7 @@ def first(rack: PrimitiveRack, **wanted: int) -> int:
 
 @pytest.fixture(scope="module")
 def finished() -> PrimitiveRack:
-    """A rack that has done both paths; its tests only look at it."""
+    """A rack that has done both paths. Tests must not change it."""
     rack = PrimitiveRack()
     rack.command(*two_paths(rack))
     assert rack.run_until_done(2)
@@ -77,7 +77,7 @@ def test_every_status_reports_progress_and_when_the_segment_will_be_done(
     assert done <= said <= done + 0.2
 
 
-def test_gripper_segments_close_and_open_and_say_what_is_held() -> None:
+def test_gripper_segments_close_and_open_and_report_the_held_object() -> None:
     rack = PrimitiveRack()
     rack.command(gripper(1, opening=0.0, held=1))
     assert rack.run_until_done(1, 3.0)
@@ -115,7 +115,7 @@ def test_move_that_cannot_be_done_by_its_time_is_refused_before_anything_moves()
         (0.0, {"by": np.nan}, "not finite"),
     ],
 )
-def test_segment_that_cannot_be_is_an_error_and_the_next_command_is_done(
+def test_an_impossible_segment_is_an_error_and_the_next_command_is_carried_out(
     offset: float, fields: dict, said: str
 ) -> None:
     rack = PrimitiveRack()
@@ -128,7 +128,7 @@ def test_segment_that_cannot_be_is_an_error_and_the_next_command_is_done(
     assert rack.status.error == 0
 
 
-def test_arm_without_gripper_or_scene_goes_along_its_path_and_refuses_a_grasp() -> None:
+def test_an_arm_without_gripper_or_scene_follows_a_path_and_refuses_a_grasp() -> None:
     rack = PrimitiveRack("k1607")
     corner = rack.home + 0.2
     rack.command(path(1, [rack.home, corner, corner - 0.3], [0.0, 0.2, 0.0]))

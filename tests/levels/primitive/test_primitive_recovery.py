@@ -1,5 +1,4 @@
-"""The primitive level when a board dies, restarts, misses cycles or falls silent, or the arm does
-not follow."""
+"""The primitive level when boards die, restart or fall silent, or the arm does not follow."""
 
 from __future__ import annotations
 
@@ -29,9 +28,7 @@ def test_arm_that_does_not_follow_is_an_error_and_comes_to_rest() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("died_at_s", "away_s"), [(0.05, 0.25), (1.2, 0.25)])
-def test_executor_that_starts_anew_finishes_what_was_under_way(
-    died_at_s: float, away_s: float
-) -> None:
+def test_a_restarted_executor_finishes_the_present_segment(died_at_s: float, away_s: float) -> None:
     rack = PrimitiveRack()
     rack.command(*two_paths(rack))
     rack.run(died_at_s)
@@ -44,7 +41,7 @@ def test_executor_that_starts_anew_finishes_what_was_under_way(
 
 
 @pytest.mark.parametrize("died_at_s", [0.1, 1.0])
-def test_executor_that_starts_anew_keeps_its_grip(died_at_s: float) -> None:
+def test_a_restarted_executor_keeps_its_grip(died_at_s: float) -> None:
     rack = PrimitiveRack()
     rack.command(gripper(1, opening=0.0, held=0, force=17.0))
     rack.run(died_at_s)
@@ -57,7 +54,7 @@ def test_executor_that_starts_anew_keeps_its_grip(died_at_s: float) -> None:
 
 
 def seconds(time_s: float) -> int:
-    """Return that time in ticks."""
+    """Return a time in ticks."""
     return round(time_s * 1e9 / CLOCK_NS)
 
 
@@ -82,7 +79,7 @@ def test_arm_rests_on_its_path_while_the_board_above_is_lost_and_continues_when_
 
 @pytest.mark.slow
 @pytest.mark.parametrize("demand", [Demand.STOP, Demand.BRAKE])
-def test_servo_that_is_stopped_for_however_long_is_waited_for(demand: Demand) -> None:
+def test_a_stopped_servo_is_waited_for_without_a_time_limit(demand: Demand) -> None:
     # The stop lasts longer than every time that may run out; brakes take the arm some way off its
     # path.
     rack = PrimitiveRack(params={"silent": 0.5, "settling": 0.5, "straying": 0.02, "astray": 0.05})
@@ -123,7 +120,7 @@ def test_set_points_never_jump_however_often_boards_are_lost() -> None:
 
 
 @pytest.mark.slow
-def test_motion_that_is_found_at_the_end_of_its_path_is_finished() -> None:
+def test_a_motion_that_resumes_at_the_end_of_its_path_is_finished() -> None:
     for length in np.random.default_rng(4).uniform(0.1, 9.0, 200):
         line = BlendedPath([[0.0], [length]], [0.0, 0.0])
         motion = PathMotion(line, Limits(*np.ones((4, 1))), bridging_s=0.5)
@@ -131,7 +128,7 @@ def test_motion_that_is_found_at_the_end_of_its_path_is_finished() -> None:
         assert motion.finished
 
 
-def test_silent_servo_is_an_error_until_it_speaks_again() -> None:
+def test_a_silent_servo_is_an_error_until_a_status_arrives() -> None:
     rack = PrimitiveRack(params={"silent": 0.5})
     rack.command(*two_paths(rack))
     rack.run(0.3)

@@ -1,4 +1,4 @@
-"""An arm on a board of its own and boards that servo its joints, under a level that swings them."""
+"""A board of an arm and boards that servo its joints, under a level that swings them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SWING_TICKS = 20
 JOINTS = config("puma560")[0].joints
 TOGETHER: Mapping[str, Mapping[str, Any]] = {"servo": {"gripper": True}}
 APART = {f"servo_{joint}": {"joints": [joint], "gripper": joint == JOINTS[-1]} for joint in JOINTS}
-"""Parameters of the boards that servo joints, by name: one for all joints, or one each."""
+"""Parameters of the boards that servo joints, by name: one board for all or one for each."""
 
 
 class JointRig:
@@ -59,17 +59,17 @@ class JointRig:
 
     @property
     def arm(self) -> ArmExecutor:
-        """The present executor of the arm: a restart replaces it."""
+        """Present executor of the arm, which a restart replaces."""
         return cast(ArmExecutor, self.rack.tasks["arm"].level)
 
     @property
     def swing(self) -> Swing:
-        """The present level above the boards that servo joints."""
+        """Present level above the boards that servo joints."""
         return cast(Swing, self.rack.tasks["swing"].level)
 
     @property
     def status(self) -> Message:
-        """The status that the board of the arm wrote last."""
+        """Last status of the board of the arm."""
         return cast(Message, self.rack.tasks["arm"].written["status"])
 
     def run(self, ticks: int) -> None:
@@ -84,15 +84,15 @@ class JointRig:
             self.braked.append(bool(self.status.braked))
 
     def inject(self, kind: str, **parameters: float) -> None:
-        """Let another fault of the arm begin in the next tick."""
+        """Begin another fault of the arm in the next tick."""
         self._faults.append(Fault(kind, parameters, 5, self.rack.tick, KINDS[kind].step))
         self.arm.inject(self._faults)
 
     def heal(self) -> None:
-        """Let all faults be over from the next tick on."""
+        """End all faults from the next tick on."""
         self._faults = []
         self.arm.inject([])
 
     def errors(self) -> Array:
-        """Return how far the arm was from its targets at each tick, (ticks, joints), rad."""
+        """Return the tracking error of the arm at each tick, (ticks, joints), rad."""
         return np.array(self.positions) - np.array(self.targets)

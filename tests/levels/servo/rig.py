@@ -23,8 +23,7 @@ PERIOD = 8
 
 
 class Course(NamedTuple):
-    """A smooth move from one place to another, (joints,) rad, from second 0 on: the minimum-jerk
-    one."""
+    """A minimum-jerk motion between two positions, (joints,), rad, that starts at second 0."""
 
     start: Array
     goal: Array
@@ -46,8 +45,10 @@ class Found(NamedTuple):
 
 
 class ServoRig:
-    """Runs executor and planner of the servo level tick by tick; the set points come from a
-    function of time."""
+    """Runs executor and planner of the servo level tick by tick.
+
+    The set points come from a function of time.
+    """
 
     executor: type[ServoLaw] = ServoExecutor
     outside: Mapping[str, type[Message]] = {"primitive.command": JointCommand}
@@ -70,17 +71,17 @@ class ServoRig:
 
     @property
     def servo(self) -> ServoExecutor:
-        """The present executor: a restart replaces it."""
+        """Present executor, which a restart replaces."""
         return cast(ServoExecutor, self.rack.tasks["servo"].level)
 
     @property
     def status(self) -> Message:
-        """The status that the executor wrote last."""
+        """Last status of the executor."""
         return cast(Message, self.rack.tasks["servo"].written["status"])
 
     @property
     def state(self) -> Message:
-        """The arm's state that the executor wrote last."""
+        """Last state of the arm that the executor wrote."""
         return cast(Message, self.rack.tasks["servo"].written["state"])
 
     def set_point(self, position: Array, velocity: Array, due: int) -> None:
@@ -117,33 +118,33 @@ class ServoRig:
         servo.acted.clear()
 
     def inject(self, kind: str, seed: int = 5, **parameters: float) -> int:
-        """Let another fault begin in the next tick; return that tick."""
+        """Begin another fault in the next tick; return that tick."""
         self._faults.append(Fault(kind, parameters, seed, self.rack.tick, KINDS[kind].step))
         self.servo.inject(self._faults)
         return self.rack.tick
 
     def heal(self) -> None:
-        """Let all faults be over from the next tick on."""
+        """End all faults from the next tick on."""
         self._faults = []
         self.servo.inject([])
 
     def restart(self) -> None:
-        """Replace the executor by a fresh one, under the same faults."""
+        """Replace the executor by a new one, with the same faults."""
         self.rack.restart("servo")
         self.servo.inject(self._faults)
 
     def alarms(self, *but: Alarm) -> list[Alarm]:
-        """Return the alarms found, in order, without `but`."""
+        """Return the alarms that were raised, in order, except `but`."""
         return [finding.alarm for _, finding in self.found if finding.alarm not in but]
 
     def miss(self, ticks: int) -> None:
         self.rack.tasks["servo"].due += ticks
 
     def stop_planner(self) -> None:
-        """Let the planner never be released again."""
+        """Stop releasing the planner."""
         self.rack.tasks["servo.planner"].due = -1
 
     def errors(self, motion: Callable[[float], tuple[Array, Array]]) -> Array:
-        """Return how far the arm was from `motion` at each tick, (ticks, joints), rad."""
+        """Return the tracking error for `motion` at each tick, (ticks, joints), rad."""
         wanted = [motion(tick * TICK_S)[0] for tick in range(len(self.positions))]
         return np.array(self.positions) - np.array(wanted)

@@ -1,5 +1,4 @@
-"""The servo level when motors or torques fail: found in bounded cycles, limits kept; and the
-monitor by itself."""
+"""The servo level when motors or torques fail: detection in bounded time within the limits."""
 
 from __future__ import annotations
 
@@ -72,7 +71,7 @@ def dashing(name: str, joint: int, side: float, **params: float | str) -> tuple[
 
 
 def found(rig: ServoRig) -> list[int]:
-    """Return the ticks in which a motor was found at fault."""
+    """Return the ticks in which a motor fault was found."""
     return [tick for tick, finding in rig.found if finding.alarm is Alarm.ACTUATOR]
 
 
@@ -112,7 +111,7 @@ def test_a_failed_motor_is_retried_and_set_points_are_followed_once_it_works() -
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("reaction", "braked"), [("hold", 0), ("stop", 1)])
-def test_an_arm_whose_motor_can_carry_the_ramp_may_do_without_the_brakes(
+def test_with_a_weak_motor_the_arm_may_ramp_to_rest_without_brakes(
     reaction: str, braked: int
 ) -> None:
     rig, dash = dashing("puma560", 0, 1.0, on_actuator_fault=reaction)
@@ -145,11 +144,11 @@ CELL = cell("puma560")
 RESTING = np.zeros((2, 6))
 REST = RESTING[0]
 HELD_BY_FRICTION = math.tanh(2.0) * CELL.model.dof_frictionloss[CELL.dof]
-"""Torques that dry friction takes at rest, N m."""
+"""Torques that dry friction absorbs at rest, N m."""
 
 
 class Bench:
-    """An arm that rests in its home, with torques left over as a test says."""
+    """An arm at rest at home, with unexplained torques that the test sets."""
 
     def __init__(self) -> None:
         self.monitor = ActuatorMonitor(CELL, following=0.02, period_s=TICK_S)
@@ -171,7 +170,7 @@ class Bench:
         return [finding for finding in found if finding is not None]
 
 
-def test_a_part_that_is_pressed_on_its_support_is_no_motor_at_fault() -> None:
+def test_pressing_a_part_on_its_support_is_not_a_motor_fault() -> None:
     bench = Bench()
     assert bench.leave(10, j2=-20.0, j3=-3.9, j5=1.1) == []
     # The arm has turned to it: only the wrist still presses, commanded a little more in every
@@ -180,7 +179,7 @@ def test_a_part_that_is_pressed_on_its_support_is_no_motor_at_fault() -> None:
         assert bench.leave(1, j5=1.6 + 0.01 * cycle) == []
 
 
-def test_a_motor_that_lacks_more_than_a_contact_takes_is_found_while_a_part_presses() -> None:
+def test_a_motor_that_lacks_more_than_a_contact_explains_is_found_while_pressing() -> None:
     bench = Bench()
     bench.leave(10, j2=-2.5, j3=-1.4, j5=2.2)
     much = (MAX_CONTACT_PART + 0.01) * CELL.bounds.torque[1]

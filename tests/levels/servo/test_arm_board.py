@@ -1,4 +1,4 @@
-"""An arm on a board of its own: driven by the torques of one board or of six, braked as a whole."""
+"""An arm with a separate board, driven by the torques of one board or of six."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_arm_is_braked_until_every_board_sends_torques_and_then_stays_where_it_i
 
 
 @pytest.mark.slow
-def test_silent_or_lost_board_brakes_all_joints_and_motion_goes_on_when_it_is_back() -> None:
+def test_a_silent_or_lost_board_brakes_all_joints_until_it_is_back() -> None:
     rig = swinging()
     rig.rack.disturb("servo_j2.command", mute, ticks=100)
     rig.run(3)

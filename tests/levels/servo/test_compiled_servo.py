@@ -1,5 +1,4 @@
-"""The servo level's compiled functions: equal to their numpy selves, bit for bit, and loaded before
-the first cycle."""
+"""The compiled functions of the servo level equal their numpy versions bit for bit."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An arm is driven while it is enabled: asked by its operator, it goes on from where it is."""
+"""An arm is only driven while it is enabled, and starts from where it is."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ AWAY = np.array([0.3, -0.2])
 
 
 class StatefulArm(IdealArm):
-    """Its drives take some ticks to be enabled, and start away from home."""
+    """An arm whose drives take some ticks to be enabled, and which starts away from home."""
 
     ticks = 5
 
@@ -53,7 +53,7 @@ class StatefulArm(IdealArm):
 
 
 class OffArm(IdealArm):
-    """Its drives count from elsewhere."""
+    """An arm whose drives have another zero position."""
 
     def sense(self) -> Sensed:
         sample = super().sense()
@@ -67,7 +67,7 @@ def rig(folder: Path, arm: str = "StatefulArm", **robot: object) -> ServoRig:
     )
 
 
-def test_an_arm_of_ones_own_waits_for_its_operator_and_goes_on_from_where_it_is(
+def test_a_users_arm_waits_for_its_operator_and_moves_from_where_it_is(
     tmp_path: Path,
 ) -> None:
     servo = rig(tmp_path)
@@ -87,7 +87,7 @@ def test_an_arm_of_ones_own_waits_for_its_operator_and_goes_on_from_where_it_is(
     assert servo.alarms() == [Alarm.BRAKES_OPENED]
 
 
-def test_a_fault_of_the_drives_is_the_reason_until_reset_and_enable(tmp_path: Path) -> None:
+def test_a_drive_fault_is_the_reported_reason_until_reset_and_enable(tmp_path: Path) -> None:
     servo = rig(tmp_path)
     operator = Operator(servo.rack)
     operator.say("servo", Operation.ENABLE)
@@ -119,7 +119,7 @@ def test_a_fault_of_the_drives_is_the_reason_until_reset_and_enable(tmp_path: Pa
 
 
 @pytest.mark.parametrize("kind", ["StatefulArm", "IdealArm"])
-def test_a_disabled_arm_is_disabled_after_a_restart_and_an_enabled_one_goes_on(
+def test_a_restarted_board_leaves_the_arm_disabled_or_enabled_as_it_was(
     tmp_path: Path, kind: str
 ) -> None:
     servo = rig(tmp_path, kind)
@@ -175,7 +175,9 @@ def test_bring_up_slows_the_operators_set_points_until_released_and_after_a_rest
 
 
 @pytest.mark.parametrize("latency_ticks", [0, 2])
-def test_offsets_make_positions_of_what_the_drives_give(tmp_path: Path, latency_ticks: int) -> None:
+def test_offsets_convert_drive_positions_to_joint_positions(
+    tmp_path: Path, latency_ticks: int
+) -> None:
     calibration = {"offset": (0.1, -0.2)}
     own = rig(tmp_path, "OffArm", enable="at-start", calibration=calibration)
     simulated = ServoRig(
@@ -193,7 +195,7 @@ def test_offsets_make_positions_of_what_the_drives_give(tmp_path: Path, latency_
     assert np.abs(scene.tool_position - tool.position).max() < 1e-3
 
 
-def test_guessed_values_keep_an_arm_of_ones_own_disabled_and_a_simulated_one_not(
+def test_guessed_values_keep_a_users_arm_disabled_but_not_a_simulated_one(
     tmp_path: Path,
 ) -> None:
     guessed = ("velocity", "torque")

@@ -1,5 +1,4 @@
-"""Encoders with a resolution and noise: the samples of the arm, and the tolerance of the
-monitors."""
+"""Encoders with a resolution and noise: samples of the arm and tolerance of the monitors."""
 
 from __future__ import annotations
 
@@ -31,7 +30,7 @@ def move() -> Course:
     return Course(np.array(config("puma560")[0].home), GOAL, 2.0)
 
 
-def test_samples_are_steps_of_the_resolution_a_joint_and_brakes_and_gate_see_the_truth() -> None:
+def test_samples_are_quantised_but_brakes_and_limit_gate_use_exact_values() -> None:
     robot, scene = config("puma560")
     steps = (1e-3, 0.0, 1e-4, 1e-3, 1e-3, 1e-3)
     robot = robot.model_copy(
@@ -67,7 +66,7 @@ def test_a_move_with_coarse_encoders_reaches_its_goal_without_a_finding(
         ("actuator-off", {"joint": 1}, Error.MOTORS),
     ],
 )
-def test_a_fault_of_a_coarse_sensor_is_not_taken_for_one_of_a_motor(
+def test_a_fault_of_a_coarse_sensor_is_not_taken_for_a_motor_fault(
     kind: str, parameters: dict[str, float], error: Error
 ) -> None:
     robot, scene = config("puma560")
@@ -80,7 +79,7 @@ def test_a_fault_of_a_coarse_sensor_is_not_taken_for_one_of_a_motor(
     assert (rig.status.state, rig.status.error) == (State.ERROR, error)
 
 
-def test_the_monitor_says_what_it_stands(tmp_path: Path) -> None:
+def test_the_tolerance_follows_from_the_encoders(tmp_path: Path) -> None:
     robot = pendulum(tmp_path)
     cell = build_cell(robot, SceneConfig(), CLOCK_NS)
     exact = tolerance(cell)

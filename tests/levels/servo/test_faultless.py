@@ -1,5 +1,4 @@
-"""Without a fault nothing is found: whole tasks with contacts and payloads, missed cycles,
-restarted boards."""
+"""Runs without faults report nothing: whole tasks, missed cycles and restarted boards."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""Parts of boards that servo joints, and of the arm's: loads on the way between references, torques
-added up."""
+"""Parts of boards that servo joints and of the board of the arm: loads and torques."""
 
 from __future__ import annotations
 
@@ -42,7 +41,7 @@ def torque(sampled: int, joint: int, newton_metres: float) -> Message:
 
 
 def joint_torques() -> JointTorques:
-    """Return those of two boards, one as fast as the arm, one of half its rate."""
+    """Return the torques of two boards, one as fast as the arm and one at half its rate."""
     robot, scene = config("puma560")
     pace = {"fast": Pace(1, 1), "slow": Pace(2, 1)}
     return JointTorques(
@@ -55,7 +54,7 @@ def readings(fast: Message, slow: Message) -> dict[str, Reading]:
     return {"fast": Reading(fast, Verdict.NEW), "slow": Reading(slow, Verdict.OLD)}
 
 
-def test_loads_go_evenly_from_one_reference_to_the_next() -> None:
+def test_loads_are_interpolated_between_references() -> None:
     loads = JointLoads(cell("puma560"))
     loads.take(reference(due=20, inertia=2.0, load=5.0), tick=0)
     loads.take(reference(due=40, inertia=4.0, load=9.0), tick=20)
@@ -64,9 +63,7 @@ def test_loads_go_evenly_from_one_reference_to_the_next() -> None:
     assert (begin[:, 0].tolist(), end[:, 0].tolist()) == ([2.0, 5.0], [4.0, 9.0])
 
 
-def test_loads_of_an_arm_that_holds_are_computed_where_it_is_and_again_only_far_from_there() -> (
-    None
-):
+def test_loads_of_a_holding_arm_are_computed_again_only_after_it_has_moved() -> None:
     puma = cell("puma560")
     loads, still = JointLoads(puma), np.zeros(6)
     loads.hold(puma.home)
@@ -148,7 +145,7 @@ MISSING: dict[str, tuple[Callable[[dict[str, Reading]], object], int, str]] = {
 
 
 @pytest.mark.parametrize("case", MISSING)
-def test_a_torque_that_must_not_move_the_arm_is_named(case: str) -> None:
+def test_a_missing_or_invalid_torque_is_reported_with_its_board(case: str) -> None:
     spoil, since, reason = MISSING[case]
     read = readings(torque(TICK - 2, 0, 7.0), torque(TICK - 3, 5, -3.0))
     spoil(read)

@@ -1,4 +1,4 @@
-"""A servo law of a user's own: one method, and all else is inherited."""
+"""A user's servo law: it defines one method and inherits everything else."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class PdLaw(ServoLaw):
     params = Gains
     settings: Gains
     scale = 1.0
-    """Of the torques of joint 1; a test changes it."""
+    """Factor of the torque of joint 1, which a test changes."""
 
     def torques(self, set_point: Motion, sensed: SensedMotion) -> Array:
         error = set_point.position - sensed.position

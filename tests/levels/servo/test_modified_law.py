@@ -1,4 +1,4 @@
-"""A servo law under control modifications: switched without a step, undone when they fail."""
+"""A servo law with control modifications: switched without a step, undone when they fail."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Half(Modification):
 
 
 class Further(Modification):
-    """Wants positions one rad further."""
+    """Moves the wanted positions by one rad."""
 
     hook = Hook.BEFORE
 
@@ -53,7 +53,7 @@ class Further(Modification):
 
 
 class Nine(Modification):
-    """Gives 9 N m in place of the law."""
+    """Sets 9 N m in place of the law."""
 
     hook = Hook.INSTEAD
 
@@ -63,7 +63,7 @@ class Nine(Modification):
 
 
 class Counts(Modification):
-    """Adds the number of its samples since it was put in, N m."""
+    """Adds the number of its samples since it was switched on, N m."""
 
     hook = Hook.AFTER
 
@@ -112,7 +112,7 @@ class SetsNothing(Modification):
 
 
 class Bench:
-    """A law of one number: torque = 3 N m + 10 N m/rad times the position wanted, modified."""
+    """A modified law with torque = 3 N m + 10 N m/rad times the wanted position."""
 
     def __init__(self, **modifications: Mapping[str, Any] | str) -> None:
         tables = {
@@ -152,7 +152,7 @@ class Bench:
     [("Half", 1.5), ("Further", 13.0), ("Nine", 9.0)],
     ids=["after", "before", "instead"],
 )
-def test_a_switch_begins_at_the_last_torque_and_goes_over_to_the_modified_law_in_the_transfer_time(
+def test_after_a_switch_the_torque_changes_over_smoothly_in_the_transfer_time(
     name: str, after: float
 ) -> None:
     bench = Bench(it=name)
@@ -177,7 +177,7 @@ def test_modifications_act_at_their_hooks_in_the_order_of_the_config() -> None:
     assert Bench(**tables).run(2).tolist() == [0.5 * 13.0 + 1.0, 0.5 * 13.0 + 2.0]
 
 
-def test_one_in_place_of_the_law_replaces_another() -> None:
+def test_a_modification_in_place_of_the_law_replaces_another() -> None:
     bench = Bench(nine="Nine", pd={"class": COMMON + "JointPd"}, huge="Huge")
     bench.switch("nine", True)
     bench.run(60)
@@ -189,11 +189,11 @@ def test_one_in_place_of_the_law_replaces_another() -> None:
     bench.switch("huge", True)
     assert np.max(bench.run(100)) == LIMITS[2]
     tables = {name: {"class": HERE + "Nine", "on": True} for name in ("one", "two")}
-    with pytest.raises(ValueError, match="one, two are on in place of the law; permitted: one"):
+    with pytest.raises(ValueError, match="only one may be on in place of the law, not one, two"):
         ModifiableParams.model_validate({"modifications": tables})
 
 
-def test_one_that_raises_is_undone_and_taken_out_in_the_same_sample() -> None:
+def test_a_modification_that_raises_is_undone_and_switched_off_in_the_same_sample() -> None:
     bench = Bench(raises="Raises", half={"class": HERE + "Half", "on": True})
     bench.run(1)
     bench.switch("raises", True)
@@ -211,7 +211,7 @@ def test_one_that_raises_is_undone_and_taken_out_in_the_same_sample() -> None:
 
 
 @pytest.mark.parametrize("name", ["GivesNan", "SetsNothing"])
-def test_one_whose_result_is_not_finite_is_taken_out_and_the_law_goes_on(name: str) -> None:
+def test_a_modification_with_a_result_that_is_not_finite_is_switched_off(name: str) -> None:
     bench = Bench(it=name)
     bench.run(1)
     bench.switch("it", True)
@@ -243,7 +243,7 @@ def test_a_dead_zone_hides_small_errors_and_reduces_larger_ones(error: float, se
     assert sample.wanted_position - sample.position == pytest.approx(seen, abs=1e-15)
 
 
-def test_pd_control_is_each_joints_own_with_its_load_or_without() -> None:
+def test_pd_controls_each_joint_separately_with_or_without_load() -> None:
     sample = sample_of(
         wanted_position=0.1, wanted_velocity=0.2, inertia=2.0, load=7.0, torque=np.nan
     )
@@ -261,7 +261,7 @@ def test_a_notch_removes_its_frequency_and_passes_others(
 ) -> None:
     notch, sample, passed = Notch(law_of(frequency=60.0)), sample_of(torque=5.0), []
     with pytest.raises(
-        LevelError, match="frequency = 500 Hz: permitted: below half the law's rate, 500 Hz"
+        LevelError, match="frequency = 500 Hz: must be below half the law's rate, 500 Hz"
     ):
         Notch(law_of(frequency=500.0))
     # It begins without a transient.
@@ -284,11 +284,11 @@ MISTAKES = {
     "half a class": ({"class": HERE + "Unfinished"}, "class 'Unfinished' lacks: modify"),
     "no hook": (
         {"class": HERE + "Hookless"},
-        "class 'Hookless' has the hook None; permitted: before, instead, after",
+        "class 'Hookless' has the hook None; must be one of before, instead, after",
     ),
     "unknown hook": (
         {"class": HERE + "Later"},
-        "class 'Later' has the hook 'later'; permitted: before, instead, after",
+        "class 'Later' has the hook 'later'; must be one of before, instead, after",
     ),
     "params of one without": (
         {"class": HERE + "Half", "params": {"gain": 2.0}},

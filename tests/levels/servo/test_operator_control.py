@@ -1,5 +1,4 @@
-"""The servo level under an operator: it holds, goes to set points within its limits and
-back, takes gains and control modifications."""
+"""The servo level under an operator: it holds, moves to set points and returns."""
 
 from __future__ import annotations
 
@@ -56,7 +55,7 @@ def test_a_hold_ramps_to_rest_and_ignores_the_level_above_until_resume(rig: Serv
 
 
 @pytest.mark.slow
-def test_a_set_point_under_way_begins_with_rest(rig: ServoRig) -> None:
+def test_a_set_point_given_during_motion_is_preceded_by_rest(rig: ServoRig) -> None:
     rig.run(SECOND, COURSE.at)
     Operator(rig.rack).say("servo", Operation.SETPOINT, AWAY)
     rig.run(1, COURSE.at)
@@ -115,7 +114,7 @@ def test_a_set_point_out_of_range_is_refused_and_the_last_command_stays_in_force
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("key", "value"), [("bandwidth", 30.0), ("damping", 0.7)])
-def test_a_gain_set_live_is_that_of_a_level_launched_with_it(key: str, value: float) -> None:
+def test_a_gain_set_live_acts_like_one_set_in_the_config(key: str, value: float) -> None:
     launched = ServoRig(*config("puma560"), **{key: value})
     tuned = ServoRig(*config("puma560"))
     Operator(tuned.rack).set("servo", f"{key}={value}")
@@ -147,7 +146,7 @@ def test_gains_act_from_the_cycle_after_their_tick_and_survive_a_restart() -> No
         "bandwidth": "must be key=value",
     }.items(),
 )
-def test_a_gain_that_cannot_be_is_refused_and_the_law_goes_on(setting: str, why: str) -> None:
+def test_an_invalid_gain_is_refused_and_the_law_continues(setting: str, why: str) -> None:
     tuned, plain = (ServoRig(*config("puma560")) for _ in range(2))
     Operator(tuned.rack).set("servo", setting)
     assert (tuned.torques(50, QUICK.at) == plain.torques(50, QUICK.at)).all()
@@ -181,7 +180,7 @@ def test_a_law_is_replaced_under_motion_without_a_step_and_the_arm_follows_its_c
     assert (rig.status.reason, rig.found) == ("", [])
 
 
-def test_a_restarted_board_puts_its_modifications_in_again() -> None:
+def test_a_restarted_board_switches_its_modifications_on_again() -> None:
     rig = rig_of(pd=PD)
     rig.torques(100, COURSE.at)
     Operator(rig.rack).modify("servo", "pd", True)

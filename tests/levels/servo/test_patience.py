@@ -1,5 +1,4 @@
-"""Every fault of the arm ends within its bound: recovered from when it is over in time, else
-latched with its cause."""
+"""Every fault of the arm ends within its bound: recovered in time or latched."""
 
 from __future__ import annotations
 
@@ -23,7 +22,7 @@ OMEGA = 2.0 * math.pi / 1.2
 PATIENCE_TICKS = 120
 WITHIN = {"patience": PATIENCE_TICKS * 0.0025, "retry": 0.05}
 RECOVERS_TICKS = 75
-"""A retry, the good cycles after it, and the rest of the last try."""
+"""Ticks of a retry, the good cycles after it, and the rest of the last try."""
 KINDS = [
     ("sensor-nan", {}, Error.SENSORS),
     ("sensor-stuck", {}, Error.SENSORS),
@@ -120,7 +119,7 @@ def test_a_latched_fault_outlasts_a_restart_of_the_board() -> None:
     )
 
 
-def test_a_demand_on_the_arm_uses_up_no_patience_and_is_the_reason() -> None:
+def test_a_demand_on_the_arm_is_the_reason_and_does_not_use_up_patience() -> None:
     rig = swinging()
     rig.inject("sensor-nan", joint=1)
     rig.rack.demand = Demand.BRAKE

@@ -1,5 +1,4 @@
-"""The servo level with faulty sensors: found in bounded cycles, braked, and resumed from where the
-arm is."""
+"""The servo level with faulty sensors: detection in bounded time, braking and resuming."""
 
 from __future__ import annotations
 
@@ -37,7 +36,7 @@ def rig_under_way(**params: float | str) -> ServoRig:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("kind", "parameters", "alarm", "bound"), KINDS)
-def test_a_fault_is_found_in_time_the_arm_braked_and_motion_resumed_and_the_status_stays_true(
+def test_a_sensor_fault_is_found_in_time_and_motion_resumes_with_a_true_status(
     kind: str, parameters: dict[str, float], alarm: Alarm, bound: int
 ) -> None:
     rig = rig_under_way()

@@ -1,5 +1,4 @@
-"""A servo level whose arm has drives that follow set points: it follows, stops, and finds what does
-not follow, as with torques."""
+"""A servo level whose arm has drives that follow set points."""
 
 from __future__ import annotations
 
@@ -32,7 +31,7 @@ STUCK_AT = 150
 
 
 class StuckServoArm(ServoArm):
-    """From a tick on its drives stay where they are, and say nothing of it."""
+    """An arm whose drives stop following from a tick on, without reporting it."""
 
     def follow(self, target: JointTarget, grip_force: float) -> Finding | None:
         kept = self._rows[0].copy()
@@ -51,7 +50,9 @@ def rig(folder: Path, interface: Interface, arm: str = "", **robot: object) -> S
 @pytest.mark.slow
 @pytest.mark.parametrize("arm", ["", OWN + "ServoArm"])
 @pytest.mark.parametrize("interface", SET_POINTS)
-def test_it_follows_a_course(tmp_path: Path, interface: Interface, arm: str) -> None:
+def test_the_arm_follows_a_motion_by_set_points(
+    tmp_path: Path, interface: Interface, arm: str
+) -> None:
     servo = rig(tmp_path, interface, arm)
     servo.run(500, COURSE.at)
     assert np.abs(servo.errors(COURSE.at)).max() < 8e-3
@@ -77,7 +78,7 @@ def test_the_end_of_a_bring_up_does_not_move_the_set_points(tmp_path: Path) -> N
 
 @pytest.mark.slow
 @pytest.mark.parametrize("interface", SET_POINTS)
-def test_as_often_as_cycles_are_missed_the_first_set_point_is_where_the_arm_is(
+def test_after_missed_cycles_the_first_set_point_is_where_the_arm_is(
     tmp_path: Path, interface: Interface
 ) -> None:
     servo = rig(tmp_path, interface)
@@ -136,7 +137,7 @@ def test_a_drive_that_does_not_follow_is_a_motor_fault(
 
 
 @pytest.mark.parametrize("interface", SET_POINTS)
-def test_set_points_are_those_of_the_end_of_the_cycle(tmp_path: Path, interface: Interface) -> None:
+def test_set_points_are_for_the_end_of_the_cycle(tmp_path: Path, interface: Interface) -> None:
     cell: Cell = build_cell(pendulum(tmp_path, interface=interface), SceneConfig(), CLOCK_NS)
     law = SetPointLaw(cell, LoopGains(), TICK_S)
     law.tune(LoopGains(bandwidth=60.0, damping=1.5))
@@ -172,7 +173,7 @@ def test_set_points_are_those_of_the_end_of_the_cycle(tmp_path: Path, interface:
         ),
     ],
 )
-def test_what_makes_no_sense_with_set_points_is_refused(
+def test_settings_that_need_torques_are_refused_with_set_points(
     rack: str, changes: list[str], mistake: str
 ) -> None:
     with pytest.raises(ConfigError) as caught:

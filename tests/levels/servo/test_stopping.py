@@ -1,5 +1,4 @@
-"""The servo level stops on a demand and when something hits the arm: a collision, named by geoms,
-is nobody's fault."""
+"""The servo level stops on a demand and when something hits the arm."""
 
 from __future__ import annotations
 
@@ -19,7 +18,7 @@ BRAKES = (Alarm.BRAKES_CLOSED, Alarm.BRAKES_OPENED)
 ROBOT, SCENE = config("puma560_crossing")
 HOME = np.array(ROBOT.home)
 FOREARM, HAND = (0.35, 1.3), (0.5, 1.1)
-"""x and z, m, at which the post meets them on its way in y."""
+"""x and z, m, at which the post meets these geoms when it moves along y."""
 
 
 def turn(time_s: float) -> tuple[Array, Array]:
@@ -33,7 +32,7 @@ def stand(_: float) -> tuple[Array, Array]:
 
 
 def under_fire(at: tuple[float, float], end_y: float, speed: float) -> ServoRig:
-    """Return an arm towards which the post comes, from second 0.4 on."""
+    """Return an arm towards which the post moves from second 0.4 on."""
     (x, z), begin_y = at, 0.85
     motion = (
         MotionConfig(body="post", at=0.0, to=(x, begin_y, z), speed=50.0),
@@ -44,7 +43,7 @@ def under_fire(at: tuple[float, float], end_y: float, speed: float) -> ServoRig:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("at", "motion"), [(FOREARM, turn)])
-def test_a_blow_at_4_m_s_is_a_collision_and_no_fault_of_motor_or_sensor_nor_a_broken_limit(
+def test_a_blow_at_4_m_s_is_a_collision_and_neither_a_fault_nor_a_violation(
     at: tuple[float, float], motion: type
 ) -> None:
     rig = under_fire(at, -0.85, 4.0)
@@ -141,7 +140,7 @@ def test_stop_ramps_to_rest_within_the_acceleration_limits_and_then_brakes() -> 
 @pytest.mark.parametrize(
     ("demand", "ticks"), [(Demand.STOP, 1), (Demand.STOP, 300), (Demand.BRAKE, 30)]
 )
-def test_afterwards_motion_starts_where_the_arm_stands_and_joins_the_set_points(
+def test_after_a_stop_motion_starts_where_the_arm_is_and_joins_the_set_points(
     demand: Demand, ticks: int
 ) -> None:
     rig, move = rig_under_way()

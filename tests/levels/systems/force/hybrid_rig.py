@@ -1,5 +1,4 @@
-"""A trajectory level, hybrid control, a board that servoes joints, and an arm with a pad over a
-table."""
+"""A trajectory level, hybrid control, a board that servoes joints, and an arm with a pad."""
 
 from __future__ import annotations
 
@@ -102,7 +101,7 @@ class HybridRig:
 
     @property
     def tool(self) -> Array:
-        """Place of the tool, m, (3,)."""
+        """Position of the tool, (3,), m."""
         return self.ik.tool_at(self.output("arm", "status").position).position
 
     def output(self, board: str, port: str) -> Message:
@@ -114,12 +113,12 @@ class HybridRig:
 
     @property
     def status(self) -> Message:
-        """What hybrid control shows to the trajectory level."""
+        """Status of hybrid control for the trajectory level."""
         return self.output("hybrid", "status")
 
     @property
     def motion(self) -> Message:
-        """The status of the trajectory level."""
+        """Status of the trajectory level."""
         return self.output("trajectory", "status")
 
     def steps(self) -> tuple[float, float]:

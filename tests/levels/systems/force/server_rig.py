@@ -1,4 +1,4 @@
-"""A server of force and motion alone, over a board that presses on a surface as a spring does."""
+"""A server of force and motion alone, with a board that presses on a surface like a spring."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ FRAME = (0.0, 0.0, 1.0, 0.0)
 HEIGHT, STEP, EDGE = 0.80, 0.012, -0.10
 """Surface, m; from y = `EDGE` on it is lower by `STEP`."""
 STIFFNESS, YIELD = 6000.0, 0.002
-"""N/m; m/s that the board goes on for each N that is missing."""
+"""Stiffness, N/m, and velocity of the board per missing force, m/s per N."""
 
 
 class ServerRig(TrajectoryRig):

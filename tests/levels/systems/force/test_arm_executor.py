@@ -1,4 +1,4 @@
-"""An arm with a wrist sensor that presses against a wall: what it measures, and when it stops."""
+"""An arm with a wrist sensor that presses against a wall: measurement and stops."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ PERIOD = 20
 FORWARD = (0.7071067811865476, 0.0, 0.7071067811865476, 0.0)
 """Orientation of a tool that points along the world's x axis."""
 FREE_M, WALL_M = 0.74, 0.76
-"""x of the tool before the wall, and with the pad on it."""
+"""x of the tool in front of the wall, and with the pad touching it."""
 
 
 class PressRig:
@@ -101,7 +101,7 @@ class PressRig:
             self.braked.append(bool(self.status.braked))
 
     def alarms(self) -> list[Alarm]:
-        """Return the alarms, but those of the brakes."""
+        """Return the alarms, except alarms of the brakes."""
         brakes = Alarm.BRAKES_CLOSED, Alarm.BRAKES_OPENED
         return [finding.alarm for _, finding in self.found if finding.alarm not in brakes]
 
@@ -115,7 +115,7 @@ def pressed(folder: Path, depth: float, seconds: float = 0.4, **arm: Any) -> Pre
     return rig
 
 
-def test_a_contact_within_the_limits_is_measured_and_no_fault(tmp_path: Path) -> None:
+def test_a_contact_within_the_limits_is_measured_and_is_not_a_fault(tmp_path: Path) -> None:
     rig = pressed(tmp_path, 0.002)
     force = rig.wrench.wrench[:3]
     assert -60.0 < force[0] < -10.0

@@ -123,7 +123,7 @@ def test_a_wait_gives_signs_of_life(bus: Bus, arm: ForceMotions) -> None:
         ),
         ("comply", "wall", {}, "contact 'wall' has no axis of force; free() ends compliance"),
         ("guard", "wipe", {}, "contact 'wipe' guards no axis"),
-        ("guard", "wood", {}, "contact 'wood' is not in [task.contact]; permitted: wipe, wall"),
+        ("guard", "wood", {}, "contact 'wood' is not in [task.contact]; valid values: wipe, wall"),
         (
             "guard",
             "wall",
@@ -165,7 +165,7 @@ def test_an_impossible_contact_is_refused_at_once(
         (
             {"contact": {"wipe": {"frame": "table", "wrench": {"z": 81.0}}}},
             "contact.wipe",
-            "frame 'table' is not in [task.frame]; permitted: none",
+            "frame 'table' is not in [task.frame]; valid values: none",
         ),
         (
             {**TASK, "contact": {"wipe": {"frame": "table", "wrench": {"z": 60.0, "x": -60.0}}}},
@@ -174,7 +174,7 @@ def test_an_impossible_contact_is_refused_at_once(
         ),
     ],
 )
-def test_a_program_that_is_impossible_is_found_before_the_launch(
+def test_an_impossible_program_is_reported_before_the_launch(
     table: Any, key: str, reason: str
 ) -> None:
     found = list(ForceProgram.model_validate(table).misfits(ROBOT, SCENE))

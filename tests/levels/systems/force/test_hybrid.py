@@ -1,5 +1,4 @@
-"""Hybrid control under a trajectory level: a tool that presses on a table, slides, and meets what
-guards it."""
+"""Hybrid control under a trajectory level: a tool that presses on a table and slides."""
 
 from __future__ import annotations
 

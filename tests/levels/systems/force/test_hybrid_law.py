@@ -1,4 +1,4 @@
-"""The law of hybrid control alone: its inverse, its limits, and what it leaves unchanged."""
+"""The law of hybrid control alone: its inverse, its limits and its constant difference."""
 
 from __future__ import annotations
 
@@ -32,24 +32,24 @@ def cell(tmp_path: Path) -> Cell:
 
 
 def resting(cell: Cell, away: float = 0.0) -> Motion:
-    """Return rest at home, all joints `away`, rad."""
+    """Return a motion at rest with all joints `away`, rad, from home."""
     return Motion(np.stack((cell.home + away, np.zeros(6), np.zeros(6))))
 
 
 def task(exerted: Array | None, rotation: Array | None = None) -> ForceTask:
-    """Return one that wants 20 N along z at 0.05 m/s at most."""
+    """Return a task with 20 N along z at 0.05 m/s at most."""
     wanted, turned = np.where(Z, 20.0, 0.0), np.eye(3) if rotation is None else rotation
     return ForceTask(turned, Z, wanted, exerted, np.full(6, 0.05))
 
 
 def place(cell: Cell, q: Array) -> Array:
-    """Return the tool's place at `q`, m."""
+    """Return the position of the tool at `q`, m."""
     tool = ToolKinematics(cell)
     tool.look(q, np.zeros(6))
     return tool.pose.position
 
 
-def test_the_inverse_gives_the_velocity_wanted_and_stays_finite_at_a_singularity(
+def test_the_inverse_gives_the_wanted_velocity_and_is_finite_at_a_singularity(
     cell: Cell,
 ) -> None:
     tool, twist = ToolKinematics(cell), np.array([0.02, -0.01, 0.03, 0.1, 0.0, -0.1])
@@ -105,7 +105,7 @@ def test_every_joint_keeps_its_acceleration(cell: Cell) -> None:
     assert law.rests
 
 
-def test_without_force_axes_the_motion_is_followed_with_the_difference_as_it_is(cell: Cell) -> None:
+def test_without_force_axes_the_difference_from_the_motion_stays_constant(cell: Cell) -> None:
     law = HybridLaw(cell, HybridGains())
     assert np.array_equal(law.step(resting(cell), None, PERIOD_S, EMPTY).position, cell.home)
     for _ in range(50):
@@ -120,7 +120,7 @@ def test_without_force_axes_the_motion_is_followed_with_the_difference_as_it_is(
     assert np.array_equal(law.step(resting(cell), None, PERIOD_S, EMPTY).position, cell.home)
 
 
-def test_the_force_wanted_is_fed_forward_as_joint_torques(cell: Cell) -> None:
+def test_the_wanted_force_is_fed_forward_as_joint_torques(cell: Cell) -> None:
     law, tool = HybridLaw(cell, HybridGains()), ToolKinematics(cell)
     exact = np.where(Z, 20.0, 0.0)
     for _ in range(300):

@@ -1,4 +1,4 @@
-"""A server of force and motion as its client and its boards see it."""
+"""A server of force and motion, seen from its client and its boards."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_a_client_that_falls_silent_leaves_a_force_that_is_held_and_then_release
     assert (rig.mode, rig.status.reason) == (Mode.MOTION, "")
 
 
-def test_a_surface_that_is_not_there_ends_compliance_with_a_reason() -> None:
+def test_a_missing_surface_ends_compliance_with_a_reason() -> None:
     rig = ServerRig(reach=1.0)
     rig.floor = 0.0
     press = rig.comply(speed=(0, 0, 0.02, 0, 0, 0))
@@ -111,7 +111,7 @@ def test_an_impossible_contact_is_refused(fields: dict[str, object], why: str) -
     assert rig.mode is Mode.MOTION
 
 
-def test_a_restarted_server_goes_on_with_the_same_contact() -> None:
+def test_a_restarted_server_continues_with_the_same_contact() -> None:
     rig = pressing()
     along = rig.line((X, EDGE + 0.05, HEIGHT), 2.0)
     rig.run(0.5)

@@ -1,5 +1,4 @@
-"""A gateway between a trajectory level and boards that servo joints: on time, extrapolating,
-frozen, and back."""
+"""A gateway between a trajectory level and boards that servo joints."""
 
 from __future__ import annotations
 
@@ -23,7 +22,7 @@ TICK_S = 0.001
 PERIOD, EVERY, DELAY, MISSING = 10, 2, 2, 5
 LATENCY = DELAY + 2 * EVERY
 SPEED = 0.5
-"""rad/s, of every joint."""
+"""Velocity of every joint, rad/s."""
 BOARDS = ("near", "far")
 SIZES = sizes(cell("puma560"))
 
@@ -88,7 +87,7 @@ class GatewayRig:
             self.tick += EVERY
 
 
-def test_references_are_handed_on_later_by_a_constant_time_and_in_time_to_be_followed() -> None:
+def test_references_are_passed_on_with_a_constant_delay_and_in_time() -> None:
     rig = GatewayRig()
     rig.run(200)
     ticks, dues, positions = zip(*rig.given, strict=True)
@@ -114,7 +113,7 @@ def test_missing_references_are_extrapolated_without_a_gap(count: int) -> None:
     assert [position for _, _, position in rig.given] == pytest.approx(wanted)
 
 
-def test_after_too_many_missing_the_arm_is_left_to_the_boards_and_then_joined_again() -> None:
+def test_after_too_many_missing_references_the_boards_hold_the_arm() -> None:
     rig = GatewayRig()
     # A level above that wants no motion is obeyed without extrapolation.
     rig.run(200, missing=True)
