@@ -55,7 +55,7 @@ class Simulation(Plant):
         )  # (joints,): true positions and velocities
         self._refresh()
         self._is_arm, self._is_gripper = np.zeros((2, cell.model.ngeom), dtype=bool)
-        self._is_arm[cell.arm_geoms] = self._is_gripper[cell.gripper_geoms] = True
+        self._is_arm[cell.geoms.arm] = self._is_gripper[cell.geoms.gripper] = True
         self._root = cell.model.body_rootid[cell.model.geom_bodyid]
         obstacles = zip(
             cell.mocap, cell.bodies[len(cell.object_qpos) :], scene.obstacles, strict=True
@@ -146,7 +146,7 @@ class Simulation(Plant):
 
     def _count_contacts(self) -> None:
         """Count the unintended contacts of the last step; keep one of the plant, or of its load."""
-        pairs = unintended_contacts(self._data, self.cell.touch)
+        pairs = unintended_contacts(self._data, self.cell.geoms.touch)
         if not len(pairs):
             return
         if not self.first_touch:

@@ -71,7 +71,7 @@ def substeps(cell: Cell, model: mujoco.MjModel, data: mujoco.MjData, steps: int)
         np.zeros((2, state_size(model))),
         data.warning.number,
         *contact_views(model, data),
-        cell.touch,
+        cell.geoms.touch,
     )
 
 

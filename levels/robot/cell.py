@@ -5,6 +5,7 @@ from __future__ import annotations
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -48,36 +49,50 @@ class Gripper:
     linkage: Linkage  # positions of all its joints, by its opening
 
 
+class CellGeoms(NamedTuple):
+    """Ids of the geoms between which contacts are judged."""
+
+    arm: Ints  # all that the arm moves, including the gripper's
+    gripper: Ints  # of the body that carries the gripper, and of the fingers
+    supports: Ints  # in the order of `scene.supports`
+    touch: Mask  # (ngeom, ngeom), True where a contact is unintended
+
+
 @dataclass(frozen=True)
 class Cell:
     """A compiled cell. Indices are addresses in `model`."""
 
     model: mujoco.MjModel
-    """Torque motors on every joint of an arm, a force motor on the gripper; of a hand, its tendons.
-    Keyframe 0 is the start, the gripper open."""
-    joints: tuple[str, ...]  # their names
-    qpos: Ints  # (joints,), the arm's joints in qpos
-    dof: Ints  # (joints,), the same in qvel
-    actuators: Ints  # (joints,), their motors in ctrl; of a hand, its flexors
+    """Has torque motors on all joints of the arm and a force motor on the gripper. For a hand, it
+    has actuators on the tendons instead. Keyframe 0 is the start, with the gripper open."""
+
+    # The arm, or a hand in its place.
+    joints: tuple[str, ...]  # names
+    qpos: Ints  # (joints,), addresses of the joints in qpos
+    dof: Ints  # (joints,), addresses of the joints in qvel
+    actuators: Ints  # (joints,), motors in ctrl; the flexors of a hand
     home: Array  # (joints,), rad: where tasks return to
     begin: Array  # (joints,), rad: positions at the start
-    homing: bool  # drives know no position before they are enabled: they find their reference
     tool: int  # site
-    gripper: Gripper | None  # None: there is none
-    arm_geoms: Ints  # geoms that the arm moves, gripper included
-    gripper_geoms: Ints  # those of hand and fingers
-    bodies: Ints  # in the order of `scene.bodies`
-    object_qpos: Ints  # (objects,), first of 7 addresses of each object
-    mocap: Ints  # (obstacles,), mocap ids
-    supports: Ints  # geoms
-    touch: Mask  # (ngeom, ngeom), True where a contact is unintended
-    bounds: Bounds  # that the arm never exceeds
+
+    # How the arm may move.
+    bounds: Bounds  # never exceeded, fault or not
     limits: Limits  # of planned motion
-    encoders: Encoders  # resolution and noise of its sensors
-    wrist: Wrist | None  # force/torque sensor; None: there is none
+    encoders: Encoders  # resolution and noise of the joints' sensors
+    patience: MotorPatience  # of the motors or valves
+    interface: Interface  # of the drives
+    homing: bool  # drives have to find their reference before they know their position
+
+    # What the arm carries.
+    gripper: Gripper | None  # None for an arm without a gripper
+    wrist: Wrist | None  # None for an arm without a force/torque sensor
     hand: Hand | None  # None for an arm
-    patience: MotorPatience  # of its motors, or valves
-    interface: Interface  # of its drives
+
+    # Its surroundings.
+    bodies: Ints  # objects, then obstacles, in the order of `scene.bodies`
+    object_qpos: Ints  # (objects,), address of the first of the 7 coordinates of each object
+    mocap: Ints  # (obstacles,), mocap ids
+    geoms: CellGeoms
 
     def start(self) -> mujoco.MjData:
         """Return data of the start: the gripper is open, objects are where the model puts them."""
@@ -133,9 +148,9 @@ def unchecked_cell(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> Cel
     prepare(spec, robot, clock_ns)
     model = compile_spec(spec, robot.model)
     check_couplings(model, robot.joints)
-    cell = index(model, robot, scene, motors, torque)
+    cell = assemble_cell(model, robot, scene, motors, torque)
     if robot.gripper is not None and ease_gripper(cell, spec, robot.gripper, clock_ns * 1e-9):
-        cell = index(compile_spec(spec, robot.model), robot, scene, motors, torque)
+        cell = assemble_cell(compile_spec(spec, robot.model), robot, scene, motors, torque)
     cell.model.key_qpos[0] = start_qpos(cell, cell.begin)
     return cell
 
@@ -158,41 +173,38 @@ def sizes(cell: Cell) -> dict[str, int]:
     return found if cell.hand is None else {**found, "fingers": len(cell.hand.names)}
 
 
-def index(
+def assemble_cell(
     model: mujoco.MjModel,
     robot: RobotConfig,
     scene: SceneConfig,
     motors: list[str],
     torque: Array,
 ) -> Cell:
-    """Find everything that the config names in the compiled model, the torques of a hand there.
-    Raises `RobotError`.
+    """Find everything that the config names in the compiled model.
+
+    Args:
+        model: The compiled model.
+        robot: The `[robot]` table.
+        scene: The `[scene]` table.
+        motors: Names of the motors, one per joint.
+        torque: Torque limits of an arm, (joints,), N m. The limits of a hand follow from its
+            tendons.
+
+    Raises:
+        RobotError: An element is missing or of the wrong kind.
     """
     joints = np.array([model.joint(name).id for name in robot.joints])
     moved = lookup.below(model, model.jnt_bodyid[joints])
     hand = None if robot.hand is None else find_hand(model, robot, robot.hand)
     tool = lookup.tool_site(model, robot.tool_name, moved if hand is None else None)
     gripper, linked = find_gripper(model, robot, moved, joints)
-    bodies = lookup.find_all(model, mujoco.mjtObj.mjOBJ_BODY, scene.bodies, "scene")
-    objects = bodies[: len(scene.objects)]
-    obstacles = bodies[len(scene.objects) :]
-    if hand is not None:  # the palm, which its joints do not move, is a part of a hand
+    if hand is not None:
+        # The palm is a part of the hand, although no joint of the hand moves it.
         linked = moved = lookup.below(model, model.site_bodyid[[tool]]) | moved
-    arm_geoms = lookup.geoms_of(model, moved)
-    gripper_geoms = lookup.geoms_of(model, linked)
-    object_geoms = lookup.geoms_of(model, lookup.below(model, objects))
-    supports = lookup.find_all(model, mujoco.mjtObj.mjOBJ_GEOM, scene.supports, "scene.supports")
-    bounds = joint_bounds(model, joints, robot, hand.torque if hand is not None else torque)
     wrist = find_wrist(model, robot.wrist, moved)
-    touch = unintended_pairs(model, arm_geoms, gripper_geoms, object_geoms, supports)
-    if wrist is not None:  # contacts of a support and what hangs on the sensor are measured
-        pressed = lookup.geoms_of(model, lookup.below(model, model.site_bodyid[[wrist.site]]))
-        touch[np.ix_(pressed, supports)] = touch[np.ix_(supports, pressed)] = False
-    data = mujoco.MjData(model)
-    data.qpos[model.jnt_qposadr[joints]] = robot.home
-    data.qvel[model.jnt_dofadr[joints]] = robot.velocity
-    mujoco.mj_fwdPosition(model, data)
-    mujoco.mj_energyVel(model, data)
+    bodies = lookup.find_all(model, mujoco.mjtObj.mjOBJ_BODY, scene.bodies, "scene")
+    objects, obstacles = np.split(bodies, [len(scene.objects)])
+    bounds = joint_bounds(model, joints, robot, torque if hand is None else hand.torque)
     return Cell(
         model=model,
         joints=robot.joints,
@@ -201,24 +213,75 @@ def index(
         actuators=np.array([model.actuator(name).id for name in motors]),
         home=np.array(robot.home),
         begin=np.array(robot.start or robot.home),
-        homing=robot.calibration.homing,
         tool=tool,
-        gripper=gripper,
-        arm_geoms=arm_geoms,
-        gripper_geoms=gripper_geoms,
-        bodies=bodies,
-        object_qpos=model.jnt_qposadr[lookup.free_joints(model, objects)].astype(int),
-        mocap=lookup.mocap_ids(model, obstacles),
-        supports=supports,
-        touch=touch,
         bounds=bounds,
         limits=planned_limits(bounds, robot),
         encoders=Encoders.of(robot, robot.substeps * model.opt.timestep),
+        patience=patience_of(robot, bounds, full_speed_energy(model, joints, robot)),
+        interface=robot.interface,
+        homing=robot.calibration.homing,
+        gripper=gripper,
         wrist=wrist,
         hand=hand,
-        patience=patience_of(robot, bounds, data.energy[1]),
-        interface=robot.interface,
+        bodies=bodies,
+        object_qpos=model.jnt_qposadr[lookup.free_joints(model, objects)].astype(int),
+        mocap=lookup.mocap_ids(model, obstacles),
+        geoms=find_geoms(model, scene, moved, linked, objects, wrist),
     )
+
+
+def find_geoms(
+    model: mujoco.MjModel,
+    scene: SceneConfig,
+    moved: Mask,
+    linked: Mask,
+    objects: Ints,
+    wrist: Wrist | None,
+) -> CellGeoms:
+    """Return the geoms of a cell, and which of their contacts are unintended.
+
+    Contacts of an object with a support or the gripper, between parts of one object, and between
+    fingers are intended. Contacts of what hangs on a wrist sensor with a support are, too, because
+    the sensor measures them. Every other contact of arm or object is unintended. Contacts between
+    other geoms are ignored.
+
+    Args:
+        model: The compiled model.
+        scene: Names the supports.
+        moved: (nbody,), the bodies that the arm moves.
+        linked: (nbody,), the bodies of the gripper.
+        objects: Ids of the bodies of the objects.
+        wrist: The force/torque sensor. None if the arm has none.
+
+    Raises:
+        RobotError: A support is missing.
+    """
+    arm = lookup.geoms_of(model, moved)
+    gripper = lookup.geoms_of(model, linked)
+    loose = lookup.geoms_of(model, lookup.below(model, objects))
+    supports = lookup.find_all(model, mujoco.mjtObj.mjOBJ_GEOM, scene.supports, "scene.supports")
+    touch = np.zeros((model.ngeom, model.ngeom), dtype=bool)
+    judged = np.union1d(arm, loose)
+    touch[judged, :] = touch[:, judged] = True
+    intended = [(loose, supports), (loose, gripper), (gripper, gripper)]
+    if wrist is not None:
+        sensed = lookup.below(model, model.site_bodyid[[wrist.site]])
+        intended.append((lookup.geoms_of(model, sensed), supports))
+    for first, second in intended:
+        touch[np.ix_(first, second)] = touch[np.ix_(second, first)] = False
+    root = model.body_rootid[model.geom_bodyid]
+    touch[np.ix_(loose, loose)] &= root[loose][:, None] != root[loose][None, :]
+    return CellGeoms(arm, gripper, supports, touch)
+
+
+def full_speed_energy(model: mujoco.MjModel, joints: Ints, robot: RobotConfig) -> float:
+    """Return the kinetic energy of the arm at home with all joints at full speed, J."""
+    data = mujoco.MjData(model)
+    data.qpos[model.jnt_qposadr[joints]] = robot.home
+    data.qvel[model.jnt_dofadr[joints]] = robot.velocity
+    mujoco.mj_fwdPosition(model, data)
+    mujoco.mj_energyVel(model, data)
+    return float(data.energy[1])
 
 
 def find_gripper(
@@ -270,29 +333,6 @@ def find_gripper(
     return gripper, linked
 
 
-def unintended_pairs(
-    model: mujoco.MjModel,
-    arm: Ints,
-    gripper: Ints,
-    objects: Ints,
-    supports: Ints,
-) -> Mask:
-    """Return (ngeom, ngeom), True where a contact of two geoms is unintended.
-
-    Intended are an object on a support, an object in the gripper, the parts of one object and the
-    fingers on each other. Every other contact of arm or object is unintended; the rest of the cell
-    is ignored.
-    """
-    touch = np.zeros((model.ngeom, model.ngeom), dtype=bool)
-    ours = np.union1d(arm, objects)
-    touch[ours, :] = touch[:, ours] = True
-    for first, second in ((objects, supports), (objects, gripper), (gripper, gripper)):
-        touch[np.ix_(first, second)] = touch[np.ix_(second, first)] = False
-    root = model.body_rootid[model.geom_bodyid]
-    touch[np.ix_(objects, objects)] &= root[objects][:, None] != root[objects][None, :]
-    return touch
-
-
 def unintended_contacts(data: mujoco.MjData, touch: Mask, within: float = 0.0) -> NDArray[np.int32]:
     """Return the pairs of geoms, (n, 2), in unintended contact, or `within` a distance, m; `touch`
     is that of `Cell`.
@@ -319,7 +359,7 @@ def ease_gripper(cell: Cell, spec: mujoco.MjSpec, config: GripperConfig, tick_s:
         gripper.linkage.set(data.qpos, opening)
         mujoco.mj_fwdPosition(model, data)
         contact = data.contact
-        ours = np.isin(contact.geom, cell.gripper_geoms).all(axis=1) & (contact.dist < 0.0)
+        ours = np.isin(contact.geom, cell.geoms.gripper).all(axis=1) & (contact.dist < 0.0)
         overlaps |= {tuple(sorted(pair)) for pair in model.geom_bodyid[contact.geom[ours]].tolist()}
     names = [[model.body(body).name for body in pair] for pair in sorted(overlaps)]
     named = [pair for pair in names if all(pair)]
@@ -368,7 +408,7 @@ def check_start(cell: Cell, robot: RobotConfig, key: str, position: Array) -> No
     near = copy(cell.model)
     set_margins(near, near.geom_margin + TOUCHING_M)
     data = replace(cell, model=near).start()
-    for pair in unintended_contacts(data, cell.touch, TOUCHING_M):
+    for pair in unintended_contacts(data, cell.geoms.touch, TOUCHING_M):
         first, second = (lookup.geom_name(cell.model, geom) for geom in pair)
         raise RobotError(
             f"robot.{key}: '{first}' touches '{second}'; move {key} or the object, name a support,"
@@ -400,10 +440,10 @@ def check_fingers(cell: Cell, config: GripperConfig) -> None:
                 f"robot.gripper.force: {config.force:g} does not bring the gripper from"
                 f" {start:.4g} to {wanted:.4g}: it settles at {opening:.4g}"
             )
-        settled = data.geom_xpos[cell.gripper_geoms].copy()
+        settled = data.geom_xpos[cell.geoms.gripper].copy()
         gripper.linkage.set(data.qpos, float(data.qpos[gripper.linkage.driven]))
         mujoco.mj_kinematics(model, data)
-        away = float(np.max(np.linalg.norm(data.geom_xpos[cell.gripper_geoms] - settled, axis=1)))
+        away = float(np.max(np.linalg.norm(data.geom_xpos[cell.geoms.gripper] - settled, axis=1)))
         if not away <= config.residual:
             raise RobotError(
                 f"robot.gripper: its couplings yield: at {opening:.4g} a finger settles"

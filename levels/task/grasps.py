@@ -122,8 +122,8 @@ def standing(cell: Cell, data: mujoco.MjData, row: int, situation: Situation) ->
     name = model.body(cell.bodies[row]).name
     x, y, z = goal.position
     support = _geom_below(cell, data, row, goal.position)
-    if support not in cell.supports:
-        supports = ", ".join(f"'{geom_name(model, g)}'" for g in cell.supports) or "none"
+    if support not in cell.geoms.supports:
+        supports = ", ".join(f"'{geom_name(model, g)}'" for g in cell.geoms.supports) or "none"
         place = f"over '{geom_name(model, support)}'" if support >= 0 else "over nothing"
         raise Refused(
             Error.UNREACHABLE,
@@ -151,7 +151,7 @@ def _geom_below(cell: Cell, data: mujoco.MjData, row: int, point: Array) -> int:
     begin = point.copy()
     while True:
         distance = mujoco.mj_ray(cell.model, data, begin, np.array(DOWN), None, 1, body, found)
-        if found[0] not in cell.arm_geoms:
+        if found[0] not in cell.geoms.arm:
             return int(found[0])
         begin[2] -= distance + SKIN_M
 

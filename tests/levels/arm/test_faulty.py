@@ -126,7 +126,7 @@ def lay_against_a_finger(made: Cell, arm: SimulatedArm, blocks: int) -> None:
     mujoco.mj_forward(made.model, data)
     finger = next(
         int(geom)
-        for geom in made.gripper_geoms
+        for geom in made.geoms.gripper
         if made.model.geom(int(geom)).name.startswith("pad")
     )
     place = data.geom_xpos[finger].copy()

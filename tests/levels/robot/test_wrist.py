@@ -27,9 +27,9 @@ def test_what_hangs_on_the_sensor_may_touch_supports_and_nothing_else(tmp_path: 
     tip, flange, table, floor = (
         model.geom(name).id for name in ("pad", "flange", "table", "pedestal")
     )
-    assert not cell.touch[tip, table]
-    assert cell.touch[tip, floor]
-    assert cell.touch[flange, table]
+    assert not cell.geoms.touch[tip, table]
+    assert cell.geoms.touch[tip, floor]
+    assert cell.geoms.touch[flange, table]
 
 
 @pytest.mark.parametrize(
