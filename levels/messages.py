@@ -1,8 +1,8 @@
-"""The messages of the default rack: commands go down, statuses come up, plans stay within a level.
+"""Messages of the default rack: commands go down, statuses come up, plans stay within a level.
 
-Symbolic sizes: `joints`, `bodies` (objects, then obstacles; at least 1) and `state` (of a simulated
-cell, see `rack.levels.robot.engine`). Quaternions are w, x, y, z. Poses are in the world frame.
-Simulated time is tick times the clock's period.
+Symbolic sizes are `joints`, `bodies` (objects, then obstacles; at least 1) and `state` (of a
+simulated cell, see `rack.levels.robot.engine`). Quaternions are w, x, y, z. Poses are in the world
+frame. Simulated time is the tick times the clock's period.
 """
 
 from __future__ import annotations
@@ -17,19 +17,23 @@ from rack.backplane.words import Demand
 from rack.levels.operator import AnsweringStatus, RelayedCommand
 
 WINDOW = 8
-"""Elemental moves in one task command: the level below never waits for a cycle of the task
-level."""
+"""Elemental moves in one task command.
+
+There are enough that the level below never waits for a cycle of the task level.
+"""
 SEGMENTS = 2
-"""Segments in one move command."""
+"""Number of segments in one move command."""
 WAYPOINTS = 24
-"""Most joint-space points of one path."""
+"""Maximum number of joint-space points of a path."""
 MOVES = 96
-"""Most elemental moves of one task program."""
+"""Maximum number of elemental moves of a task program."""
 SECTIONS_A_LINE = 8
-"""Sections of constant jerk for one line of a path and the corner after it: seven change speed, one
-keeps it."""
+"""Sections of constant jerk for one line of a path and the corner after it.
+
+Seven sections change the speed, and one keeps it.
+"""
 SECTIONS = SECTIONS_A_LINE * (WAYPOINTS - 1)
-"""Most sections of constant jerk of one trajectory."""
+"""Maximum number of sections of constant jerk of a trajectory."""
 
 
 class Error(IntEnum):
@@ -47,17 +51,17 @@ class Error(IntEnum):
     BELOW = 9
     TOUCHED = 10
     SENSORS = 11  # a sensor did not recover within its bound
-    BLOCKED = 12  # something stays in the way, after as many replans as permitted
-    OVERLOAD = 13  # more than motors or gripper can carry
+    BLOCKED = 12  # an obstacle remains after the maximum number of replans
+    OVERLOAD = 13  # the load exceeds what motors or gripper can carry
     STALLED = 14  # nothing has moved for the time that the task permits
-    MOTORS = 15  # a motor did not give its torque, however often it was retried
-    TABLE = 16  # a state table came to a row with status error
-    GIVEN_UP = 17  # the program of several racks was given up, for a reason in another one
-    FORCE = 18  # a contact stronger than the arm's limits
+    MOTORS = 15  # a motor did not produce its torque in any retry
+    TABLE = 16  # a state table reached a row with status error
+    GIVEN_UP = 17  # another rack made all racks give up their common program
+    FORCE = 18  # a contact exceeded the arm's limits of force
     CLIENT = 19  # a server's client is lost or silent
     CONTACT = 20  # a contact was not made, or was lost
-    DISABLED = 21  # the arm is not enabled yet, or no more: its operator enables it
-    DRIVES = 22  # the arm's drives report a fault: its operator resets it
+    DISABLED = 21  # the arm is not enabled; its operator has to enable it
+    DRIVES = 22  # the arm's drives report a fault; its operator has to reset it
 
 
 class Verb(IntEnum):
@@ -102,7 +106,7 @@ class ElementalMove(Message, version=1):
 
 
 class TaskPlan(Message, version=1):
-    """From the planner of the task level to its executor: the program, decomposed."""
+    """The task level's plan, from planner to executor: the program as elemental moves."""
 
     id: int = integer("serial of the plan")
     error: Error = field("u2", doc="why the program is refused; 0: it is not refused")
@@ -113,7 +117,7 @@ class TaskPlan(Message, version=1):
 
 
 class TaskCommand(RelayedCommand, version=2):
-    """From the task level to the elemental move level: a window on the plan."""
+    """Command from the task level to the elemental move level: the next moves of the plan."""
 
     hold: bool = field(doc="1: ramp to rest and stay, whatever is under way")
     count: int = integer("moves that follow; id is the newest one's", "u2")
@@ -156,7 +160,7 @@ class MoveStatus(AnsweringStatus, version=3):
 
 
 class MovePlan(Message, version=1):
-    """From the planner of the elemental move level to its executor: a path for one move."""
+    """The elemental move level's plan, from planner to executor: a path for one move."""
 
     move: int = integer("elemental move that the plan serves")
     replan: int = integer("request that it answers; 0: the first plan of the move")
@@ -195,7 +199,7 @@ class MoveSegment(Message, version=1, message="segment"):
 
 
 class MoveCommand(RelayedCommand, version=2):
-    """From the elemental move level to the primitive level: the next segments."""
+    """Command from the elemental move level to the primitive level: the next segments."""
 
     hold: bool = field(doc="1: ramp to rest on the path and stay")
     count: int = integer("segments that follow; id is the newest one's", "u2")
@@ -225,7 +229,7 @@ class PrimitiveStatus(AnsweringStatus, version=3):
 
 
 class TrajectoryPlan(Message, version=1, message="trajectory"):
-    """From the planner of the primitive level to its executor: when the arm is where on a path."""
+    """The primitive level's plan, from planner to executor: the timing of a path."""
 
     segment: int = integer("segment that it serves")
     error: Error = field("u2", doc="why there is none; 0: there is")
@@ -244,7 +248,7 @@ class TrajectoryPlan(Message, version=1, message="trajectory"):
 
 
 class JointCommand(RelayedCommand, version=2, message="joint_set_point"):
-    """From the primitive level to the servo level: where the joints should be, and when."""
+    """Command from the primitive level to the servo level: a joint set point and its due tick."""
 
     due: int = field(
         unit="tick", doc="tick at which the arm should be there; 0: no set point yet, hold"
@@ -258,7 +262,7 @@ class JointCommand(RelayedCommand, version=2, message="joint_set_point"):
 
 
 class ArmSetPoint(Protocol):
-    """What the servo level takes of a set point, of whichever message: see `JointCommand`."""
+    """Fields that the servo level reads from a set point message, such as `JointCommand`."""
 
     due: int
     position: ndarray
@@ -268,7 +272,7 @@ class ArmSetPoint(Protocol):
 
 
 class ServoPlan(Message, version=1):
-    """From the planner of the servo level to its executor: the inertia of arm and load."""
+    """The servo level's plan, from planner to executor: the inertia of arm and load."""
 
     inertia: ndarray = field(
         unit="kg m2",
@@ -281,7 +285,7 @@ class ServoPlan(Message, version=1):
 
 
 class DrivenArm(AnsweringStatus):
-    """Fields of the status of a level that drives an arm."""
+    """Base class for the status of a level that drives an arm."""
 
     position: ndarray = per_joint("rad", "joint positions, measured; estimated for suspect sensors")
     velocity: ndarray = per_joint("rad/s", "joint velocities, likewise")
@@ -339,7 +343,7 @@ class ArmState(Message, version=3):
 
 
 class Scene(Message, version=1):
-    """Bodies and tool as sensed."""
+    """Sensed poses of bodies and tool."""
 
     position: ndarray = field(unit="m", doc="body origins as sensed", shape=("bodies", 3))
     quaternion: ndarray = field(unit="1", doc="body orientations as sensed", shape=("bodies", 4))
@@ -348,7 +352,7 @@ class Scene(Message, version=1):
 
 
 class WorldState(Message, version=1, message="world_model"):
-    """Bodies as the world model knows them."""
+    """Poses of bodies in the world model."""
 
     revision: int = integer(
         "rises when a body starts to move and when it rests again; 0: nothing sensed"

@@ -1,8 +1,8 @@
-"""What a rack knows of another one on the network: the mailbox `lan.peer_<rack>` of its adapter,
-for levels to read.
+"""State of another rack on the network, for levels to read.
 
 A level that works together with another rack reads it with `Input(PeerPresence,
-"lan.peer_<rack>")`: whether that rack is there, and how its simulated time lies next to ours.
+"lan.peer_<rack>")`, a mailbox of the network adapter. It shows whether that rack is present, and
+the offset between its simulated time and ours.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from enum import IntEnum
 from rack.backplane.message import Message, field, integer
 
 DRIFT_PPM = 100
-"""Largest difference between the rates of two clocks: each crystal within 50 ppm."""
+"""Maximum difference between the rates of two clocks, since each crystal is within 50 ppm."""
 
 
 class Presence(IntEnum):
-    """Where another rack is."""
+    """Whether another rack is present."""
 
     AWAITED = 0  # not seen yet
     THERE = 1
@@ -24,7 +24,7 @@ class Presence(IntEnum):
 
 
 class PeerPresence(Message, version=1, message="peer"):
-    """Where another rack is, and its clock; written by the network adapter."""
+    """Presence and clock of another rack, written by the network adapter."""
 
     presence: Presence = field(doc="awaited, there or lost")
     launch: int = field(
@@ -52,5 +52,8 @@ class PeerPresence(Message, version=1, message="peer"):
 
 
 def peer_port(rack: str) -> str:
-    """Return the adapter's port for a rack: names of mailboxes have no hyphens."""
+    """Return the name of the adapter's port for a rack.
+
+    Hyphens become underscores, because names of mailboxes must not contain hyphens.
+    """
     return f"peer_{rack.replace('-', '_')}"

@@ -1,7 +1,7 @@
 """Config tables that levels read: `[robot]`, `[scene]`, and the base of `[board.<name>.params]`.
 
-An arm is data: an MJCF file, and in `[robot]` the rest. `rack.levels.robot` builds the cell from
-both.
+An arm is data: an MJCF file describes it, and `[robot]` adds the rest. `rack.levels.robot` builds
+the cell from both.
 """
 
 from __future__ import annotations
@@ -34,34 +34,39 @@ from rack.levels.references import find_class
 
 T = TypeVar("T")
 
-# No quantity of an arm in SI units, and no time of a run, exceeds these: sums and squares of them
-# stay finite. pydantic keeps one bound of each kind, so a narrower field uses `le` and `ge`.
 MOST = 1e9
+"""Bound of all quantities of an arm in SI units, and of all times of a run.
+
+Sums and squares of such values stay finite. pydantic keeps one bound of each kind, so a field with
+narrower bounds uses `le` and `ge`."""
 MOST_JOINTS = 16
-"""Of an arm."""
+"""Maximum number of joints of an arm."""
 Positive = Annotated[float, Field(gt=0, lt=MOST, allow_inf_nan=False)]
 Finite = Annotated[float, Field(gt=-1e9, lt=1e9, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Vector = tuple[Finite, Finite, Finite]
 Interface = Literal["torque", "position", "velocity"]
-"""What drives take; with the last two they close loops of their own."""
+"""Commands that drives accept.
+
+Drives that accept positions or velocities close their control loops themselves.
+"""
 Moment = Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False)]
 """Simulated time, s."""
 LAST_TICK = 10**15
-"""Ticks are 64-bit words: this many of the shortest ones last 300 years."""
+"""Maximum tick. Ticks are 64-bit words; this many of the shortest ones last 300 years."""
 Tick = Annotated[int, Field(ge=0, le=LAST_TICK)]
 
 
 LIVE: JsonDict = {"live": True}
 Live = Annotated[T, Field(json_schema_extra=LIVE)]
-"""A field of params that an operator may set while the level runs: `gain: Live[Positive] = 2.0`."""
+"""Field of params that an operator may set while the level runs: `gain: Live[Positive] = 2.0`."""
 
 
 class Table(BaseModel):
-    """Base of every config table: unknown keys are errors, values are frozen, `true` does not pass
-    for 1.
+    """Base class of every config table.
 
-    A text below a field is its description: see `keys_of`.
+    Unknown keys are errors, values are frozen, and `true` is not accepted for 1. A text below a
+    field is its description: see `describe_keys`.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
@@ -69,19 +74,19 @@ class Table(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _with_tuples(cls, table: Any) -> Any:
-        """Turn TOML's lists into tuples, which are frozen."""
+        """Convert TOML's lists to tuples, which are frozen."""
         if not isinstance(table, dict):
             return table
-        # Dicts of the user's own keys stay as given.
+        # Dicts with keys that the user chooses are not changed.
         return {k: v if isinstance(v, dict) else frozen(v) for k, v in table.items()}
 
 
 def keys_of(kind: type[BaseModel]) -> dict[str, FieldInfo]:
     """Return the fields of a table by their keys, each with its description.
 
-    Where a field has none, that is the text below it. pydantic can look for such texts itself
-    (`use_attribute_docstrings`), but does so in every class that is made: each start of a rack
-    would take 0.2 s longer.
+    A field without a description takes the text below it. pydantic can look for such texts itself
+    (`use_attribute_docstrings`), but does so for every class when it is defined, so that each start
+    of a rack would take 0.2 s longer.
     """
     below = ChainMap(*(_texts_below(base) for base in kind.__mro__ if issubclass(base, Table)))
     for name, field in kind.model_fields.items():
@@ -93,7 +98,8 @@ def keys_of(kind: type[BaseModel]) -> dict[str, FieldInfo]:
 def _texts_below(table: type[Table]) -> dict[str, str]:
     """Return the texts below the fields of a class in its source, by field."""
     found = {}
-    with suppress(OSError, TypeError):  # a class typed at a prompt has no source
+    # A class typed at a prompt has no source.
+    with suppress(OSError, TypeError):
         (declared,) = ast.parse(dedent(inspect.getsource(table))).body
         assert isinstance(declared, ast.ClassDef)
         for pair in pairwise(declared.body):
@@ -104,7 +110,7 @@ def _texts_below(table: type[Table]) -> dict[str, str]:
 
 
 def frozen(value: Any) -> Any:
-    """Return a value of TOML with tuples in place of all lists in it, also of those in tables."""
+    """Return a TOML value with tuples instead of lists, also inside tables."""
     if isinstance(value, dict):
         return {key: frozen(item) for key, item in value.items()}
     return tuple(map(frozen, value)) if isinstance(value, list) else value
@@ -114,7 +120,11 @@ Params = TypeVar("Params", bound=Table)
 
 
 def read_params(kind: type[Params], params: Mapping[str, Any]) -> Params:
-    """Return `params` as `kind`. Raises `LevelError` with the key, its value and the valid keys."""
+    """Validate `params` and return them as a record of class `kind`.
+
+    Raises:
+        LevelError: A value is invalid. The text has the key, the value and the valid keys.
+    """
     try:
         return kind(**params)
     except ValidationError as error:
@@ -127,22 +137,32 @@ def read_params(kind: type[Params], params: Mapping[str, Any]) -> Params:
 
 
 def live_keys(kind: type[Table] | None) -> tuple[str, ...]:
-    """Return the params that may be set while their level runs."""
+    """Return the names of the params that may be set while the level runs."""
     fields = {} if kind is None else kind.model_fields
     return tuple(key for key, field in fields.items() if field.json_schema_extra == LIVE)
 
 
 def read_setting(setting: str) -> tuple[str, Any]:
-    """Return key and value of "key=value", with the value in TOML. Raises `LevelError`."""
+    """Return key and value of "key=value", with the value in TOML.
+
+    Raises:
+        LevelError: The text has another form.
+    """
     key, _, text = setting.partition("=")
     try:
         return key.strip(), load_toml(f"value = {text}")["value"]
-    except ValueError:  # the parser's own errors are such
+    # The errors of the TOML parser derive from `ValueError`.
+    except ValueError:
         raise LevelError("must be key=value, as in bandwidth=80") from None
 
 
 def set_live(params: Params, setting: str) -> tuple[Params, str]:
-    """Return `params` with a live one set anew by "key=value", and why not; empty: it is set."""
+    """Set a live parameter by "key=value".
+
+    Returns:
+        The new params, and why the parameter was not set, empty if it was. A refused setting leaves
+        the params unchanged.
+    """
     kind = type(params)
     try:
         key, value = read_setting(setting)
@@ -154,7 +174,11 @@ def set_live(params: Params, setting: str) -> tuple[Params, str]:
 
 
 def named_class(reference: str, base: type[T]) -> type[T]:
-    """Return the subclass of `base` that "package.module:Class" names. Raises `ValueError`."""
+    """Return the subclass of `base` that "package.module:Class" names.
+
+    Raises:
+        ValueError: It is missing or no such subclass.
+    """
     try:
         return find_class(reference, base)
     except LookupError as error:
@@ -162,10 +186,10 @@ def named_class(reference: str, base: type[T]) -> type[T]:
 
 
 class SensorConfig(Table):
-    """Resolution and noise of the joints' encoders: one value for all joints, or a list with one
-    per joint; 0: exact.
+    """Resolution and noise of the joint encoders.
 
-    Velocities have ten times as much of both, in rad/s; see `rack.levels.robot.limits.Encoders`.
+    One value for all joints, or a list with one per joint. 0 means exact. Velocities have ten times
+    as much of both, in rad/s; see `rack.levels.robot.limits.Encoders`.
     """
 
     resolution: NotNegative | tuple[NotNegative, ...] = 0.0
@@ -178,21 +202,25 @@ class CalibrationConfig(Table):
     """`[robot.calibration]`: how the drives' samples become positions of the joints."""
 
     offset: tuple[Finite, ...] | None = None
-    """added to every position that the drives give, rad; default: nothing"""
+    """added to every position that the drives report, rad; default: nothing"""
     homing: bool = False
     """the drives find their reference while they are being enabled, and know no position before
     that"""
 
 
 DAMPING_S = 0.03
-"""Damping of a gripper's loop per stiffness, where none is given."""
+"""Default damping of a gripper's loop, divided by its stiffness, s."""
 STILL_PARTS = 20
-"""The opening may be a length or an angle: what counts as no motion is a part of the whole."""
+"""Divisor of the gripper's travel that yields its threshold of motion.
+
+The opening may be a length or an angle, so the threshold is relative.
+"""
 
 
 class FollowConfig(Table):
-    """`[[robot.gripper.follow]]`: a joint that the gripper moves, though the model couples it to
-    nothing. Its own actuator is removed.
+    """`[[robot.gripper.follow]]`: a joint that moves with the gripper's driven joint.
+
+    For joints that the model does not couple. Their actuators are removed.
     """
 
     joint: str
@@ -233,7 +261,7 @@ class GripperConfig(Table):
 
     @property
     def travel(self) -> float:
-        """The way of the driven joint from open to closed, m or rad."""
+        """Distance of the driven joint from open to closed, m or rad."""
         return abs(self.open - self.closed)
 
     @property
@@ -244,14 +272,15 @@ class GripperConfig(Table):
 
     @property
     def still(self) -> float:
-        """Part of that way, m or rad, that counts as none; and in a second, as rest."""
+        """Motion of the driven joint that counts as none, m or rad.
+
+        The same in one second is the speed that counts as rest.
+        """
         return self.travel / STILL_PARTS
 
 
 class WristConfig(Table):
-    """`[robot.wrist]`: a force/torque sensor between arm and tool, and the arm's limits on
-    contact.
-    """
+    """`[robot.wrist]`: a force/torque sensor between arm and tool, and limits on contact."""
 
     force: str
     """MJCF force sensor; its cutoff is its range, N"""
@@ -277,8 +306,9 @@ class FingerConfig(Table):
 
 
 class HandConfig(Table):
-    """`[robot.hand]`: a hand whose joints are driven by pairs of tendons, which can only pull. One
-    value per joint.
+    """`[robot.hand]`: a hand whose joints are driven by pairs of tendons, which can only pull.
+
+    Lists have one value per joint.
     """
 
     finger: tuple[FingerConfig, ...] = Field(min_length=1)
@@ -306,8 +336,9 @@ class ToolConfig(Table):
 
 
 class RobotConfig(Table):
-    """`[robot]`: an arm, by its MJCF file and the data missing there. Lists have one value per
-    joint.
+    """`[robot]`: an arm, given by its MJCF file and data that the file lacks.
+
+    Lists have one value per joint.
     """
 
     model: Path = Field(strict=False)
@@ -373,35 +404,37 @@ class RobotConfig(Table):
     simulated is not enabled before each is confirmed, by removing it here"""
 
     def misfits(self) -> Iterator[tuple[str, Any, str]]:
-        """Yield key, values and reason for every list without one value per joint."""
+        """Yield key, values and reason for every list that does not have one value per joint."""
         joints = len(self.joints)
         keys = ("home", "start", "velocity", "acceleration", "jerk", "torque", "position")
         lists = {key: getattr(self, key) for key in keys}
         lists["calibration.offset"] = self.calibration.offset
         for key, values in lists.items():
             if values is not None and len(values) != joints:
-                yield key, values, f"{len(values)} values; permitted: {joints}, one per joint"
+                yield key, values, f"has {len(values)} values but needs {joints}, one per joint"
         for key, values in self.sensors or ():
             if isinstance(values, tuple) and len(values) != joints:
-                permitted = f"one for all joints, or {joints}, one per joint"
-                yield f"sensors.{key}", values, f"{len(values)} values; permitted: {permitted}"
+                why = f"has {len(values)} values but needs one for all joints, or one per joint"
+                yield f"sensors.{key}", values, f"{why}: {joints}"
 
     @field_validator("guessed")
     @classmethod
     def _are_keys(cls, names: tuple[str, ...]) -> tuple[str, ...]:
         for name in names:
             if name.partition(".")[0] not in cls.model_fields:
-                raise ValueError(f"'{name}' is no key of [robot]; `rack schema robot` lists them")
+                raise ValueError(
+                    f"'{name}' is not a key of [robot]; `rack schema robot` lists them"
+                )
         return names
 
     @property
     def tool_name(self) -> str:
-        """The site whose pose is the tool's: one that the table places has a name of its own."""
+        """Name of the site whose pose is the pose of the tool. With `tool_offset`, a new name."""
         return self.tool if self.tool_offset is None else f"tool of {self.tool}"
 
 
 class MotionConfig(Table):
-    """A move of an obstacle, a mocap body, which the simulated cell makes at a fixed time."""
+    """A move of an obstacle, a mocap body, in the simulated cell at a fixed time."""
 
     body: str
     """obstacle that moves"""
@@ -414,7 +447,7 @@ class MotionConfig(Table):
 
 
 class PushConfig(Table):
-    """`[[scene.push]]`: a force on an object, which the simulated cell exerts at a fixed time."""
+    """`[[scene.push]]`: a force on an object in the simulated cell at a fixed time."""
 
     body: str
     """object that is pushed"""
@@ -429,22 +462,23 @@ class PushConfig(Table):
 
 
 class GoalConfig(Table):
-    """`[[scene.goal]]`: where the task takes an object. A task of transfers states goals by
-    itself.
+    """`[[scene.goal]]`: where the task takes an object.
+
+    Not needed for a task of transfers, which has its goals in the program.
     """
 
     object: str
     """object that the task moves, or keeps"""
     position: Vector
     """where its origin ends, m"""
-    # A gripper centres a part across its pads, not along them: there it stays as far off as it was
-    # taken, or slips.
+    # A gripper centres a part across its pads, but not along them. In that direction the part keeps
+    # its offset, or slips.
     tolerance_mm: Positive = 10.0
     """distance from there at which the task still counts as done, mm"""
 
 
 class SceneConfig(Table):
-    """`[scene]`: objects and obstacles in the cell, by their names in the MJCF."""
+    """`[scene]`: objects and obstacles in the cell, by their names in the MJCF file."""
 
     objects: tuple[str, ...] = ()
     """free bodies that tasks may move"""
@@ -463,5 +497,5 @@ class SceneConfig(Table):
 
     @property
     def bodies(self) -> tuple[str, ...]:
-        """Objects, then obstacles: the order of the world model's rows."""
+        """Objects, then obstacles, in the order of the rows of the world model."""
         return self.objects + self.obstacles

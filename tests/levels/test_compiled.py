@@ -108,7 +108,7 @@ def test_what_decides_the_code_decides_whether_it_is_compiled(
 
 @pytest.mark.parametrize("value", ["object()", "[1.0]", "__import__('random')"])
 def test_a_name_whose_value_may_change_unseen_is_refused(value: str) -> None:
-    with pytest.raises(TypeError, match="is no constant of compiled code"):
+    with pytest.raises(TypeError, match="cannot be a constant in compiled code"):
         outer_of(factor=value).load()
 
 
@@ -134,7 +134,7 @@ def test_damaged_code_is_compiled_again_and_said(
     (file,) = kept(tmp_path)
     damage(file)
     assert called() == 3.0
-    assert capsys.readouterr().err == f"{file}: damaged; compiled again\n"
+    assert capsys.readouterr().err == f"{file} is damaged; the function is compiled again\n"
     assert called() == 3.0
     assert len(heard) == 2
     assert kept(tmp_path) == [file]
@@ -173,6 +173,6 @@ def test_a_cache_that_cannot_be_written_is_said_once_with_its_cure(
     file.touch()
     assert [called(), called(), called(scaled)] == [3.0, 3.0, 4.5]
     (line,) = capsys.readouterr().err.splitlines()
-    assert "compiled code cannot be kept, and every launch compiles: " in line
-    assert line.endswith("XDG_CACHE_HOME=FOLDER names one that can be written")
+    assert "compiled code cannot be saved, so every launch compiles it again: " in line
+    assert line.endswith("set XDG_CACHE_HOME to a folder that can be written")
     assert len(heard) == 3

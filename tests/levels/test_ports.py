@@ -61,7 +61,7 @@ def test_a_level_without_a_board_has_empty_readings_and_messages_of_its_own() ->
     ("body", "why"),
     [
         ({"context": Input(Number, "a.b")}, ""),
-        ({"inputs": {"a": Input(Number, "a.b")}}, "'inputs' is not a dict any more"),
+        ({"inputs": {"a": Input(Number, "a.b")}}, "'inputs' is no longer a dict"),
         ({"process": Input(Number, "a.b")}, "port 'process' has the name of another attribute"),
         ({"params": Output(Number)}, "port 'params' has the name of another attribute"),
         ({"above": 3}, "attribute 'above' has the name of a port"),

@@ -118,7 +118,7 @@ WRONG_CONFIGS = {
     ),
     "twice": ({"joints": ("elbow", "elbow")}, "'elbow' is named 2 times"),
     "tool": ({"tool": "tcp"}, "robot.tool: no site 'tcp' in the model; it has: tip"),
-    "length": ({"velocity": (1.0,)}, "robot.velocity: 1 values; permitted: 2, one per joint"),
+    "length": ({"velocity": (1.0,)}, "robot.velocity: has 1 values but needs 2, one per joint"),
     "home outside": ({"home": (0.0, 2.5)}, "joint 'elbow' at 2.5 rad; -1.995 to 1.995 is valid"),
     "home touches": ({"home": (1.5, 0.5)}, "'floor' touches 'lower'"),
     "too weak": ({"torque": (1.0, 20.0)}, "joint 'shoulder' carries"),
