@@ -204,8 +204,8 @@ class CalibrationConfig(Table):
     offset: tuple[Finite, ...] | None = None
     """added to every position that the drives report, rad; default: nothing"""
     homing: bool = False
-    """the drives find their reference while they are being enabled, and know no position before
-    that"""
+    """whether the drives search for their reference while they are being enabled, and know no
+    position before"""
 
 
 DAMPING_S = 0.03
@@ -226,7 +226,7 @@ class FollowConfig(Table):
     joint: str
     """MJCF joint that follows the driven one"""
     ratio: Finite = 1.0
-    """its motion per motion of the driven joint, from the model's reference pose"""
+    """motion of the joint divided by the motion of the driven joint, from the model's reference pose"""
 
 
 class GripperConfig(Table):
@@ -239,19 +239,19 @@ class GripperConfig(Table):
     open: Finite
     """joint position when open, m or rad"""
     closed: Finite
-    """joint position when closed on nothing, m or rad"""
+    """joint position when closed without an object, m or rad"""
     force: Positive
     """largest force or torque of the actuator, N or N m"""
     stiffness: Positive | None = None
-    """position loop, N/m or N m/rad; default: all of the force at half of the way to closed"""
+    """of the position loop, N/m or N m/rad; default: full force at half of the travel"""
     damping: Positive | None = None
-    """position loop, N s/m or N m s/rad; default: 30 ms times the stiffness"""
+    """of the position loop, N s/m or N m s/rad; default: 30 ms times the stiffness"""
     follow: tuple[FollowConfig, ...] = ()
-    """joints that follow the driven one, where the model does not say so"""
+    """joints that follow the driven joint although the model does not couple them"""
     residual: Positive = 0.012
-    """how far fingers may settle from where planning poses them, because soft couplings yield, or a
-    loop may stay open, m; by default less than the 15 mm that planned motion keeps from
-    everything"""
+    """largest distance by which fingers may settle from their planned pose because soft couplings
+    yield, or by which a loop may stay open, m; the default is less than the 15 mm clearance of
+    planned motion"""
 
     @model_validator(mode="after")
     def _opens(self) -> GripperConfig:
@@ -316,14 +316,14 @@ class HandConfig(Table):
     flexors: tuple[str, ...]
     """MJCF actuators on the tendons that turn a joint in positive direction"""
     extensors: tuple[str, ...]
-    """MJCF actuators on the tendons that turn it back"""
+    """MJCF actuators on the tendons that turn a joint in negative direction"""
     least: Positive
     """tension below which a tendon is slack, N"""
     rest: Positive
-    """mean tension of a pair at rest, N; it stiffens nothing in a linear tendon"""
+    """mean tension of a pair at rest, N; it does not stiffen joints with linear tendons"""
     closed: NotNegative = 0.0
-    """stiffness of a tendon whose valve is closed, by the air in it, N/m; 0: it keeps its
-    tension"""
+    """stiffness of a tendon whose valve is closed, due to the enclosed air, N/m; with 0 it keeps
+    its tension"""
 
 
 class ToolConfig(Table):
@@ -332,7 +332,7 @@ class ToolConfig(Table):
     position: Vector = (0.0, 0.0, 0.0)
     """of the tool in the body's frame, m"""
     quaternion: tuple[Finite, Finite, Finite, Finite] = (1.0, 0.0, 0.0, 0.0)
-    """of the tool in the body's frame, as w, x, y, z; its z axis approaches"""
+    """of the tool in the body's frame, as w, x, y, z; its z axis is the direction of approach"""
 
 
 class RobotConfig(Table):
@@ -367,41 +367,41 @@ class RobotConfig(Table):
     position: tuple[tuple[Finite, Finite], ...] | None = None
     """position limits, rad; default: the model's joint ranges"""
     interface: Interface = "torque"
-    """what the drives take in every cycle: torques, or set points of position or velocity, which
-    they follow by loops of their own; the simulated arm's drives are such, too"""
+    """command that the drives accept in every cycle: torques, or set points of position or velocity
+    for drives that close their control loops themselves, which the simulated arm does, too"""
     exclude: tuple[tuple[str, str], ...] = ()
-    """pairs of MJCF bodies whose contacts do not count, beside the model's own"""
+    """pairs of MJCF bodies whose contacts are ignored, in addition to those of the model"""
     gripper: GripperConfig | None = None
     """gripper, if the arm has one"""
     sensors: SensorConfig | None = None
     """resolution and noise of the joints' encoders; default: exact if they are simulated, 1e-4 and
     5e-5 rad otherwise, see `rack.levels.arm.Arm.sensors`"""
     calibration: CalibrationConfig = CalibrationConfig()
-    """from the drives' samples to positions"""
+    """conversion of the drives' samples to joint positions"""
     latency_ticks: int = Field(0, ge=0, le=20)
-    """age of the newest sample when a cycle reads it, ticks, as a bus to the drives has it; the
-    simulated arm's samples are that old, too"""
+    """age of the newest sample when a cycle reads it, due to the bus to the drives, ticks; the
+    simulated arm delays its samples accordingly"""
     wrist: WristConfig | None = None
     """force/torque sensor, if the arm has one"""
     hand: HandConfig | None = None
     """tendons and fingers, for a hand in place of an arm"""
     patience_ms: Positive | None = Field(None, le=100.0)
-    """time without a new torque for which motors keep the last one, ms; then the brakes engage;
-    rounded down to whole torque cycles, at least one; default: by what the arm does in it, see
-    `rack check --verbose`"""
+    """time for which motors keep the last torque when no new one arrives, ms; then the brakes
+    engage; rounded down to whole torque cycles, at least one; the default depends on the arm's
+    motion in that time, see `rack check --verbose`"""
     substeps: int = Field(5, ge=1, le=50)
     """MuJoCo steps in one servo cycle"""
     min_armature: Finite = Field(0.05, ge=0)
-    """least drive inertia of every joint, kg m2: light wrists need it"""
+    """minimum drive inertia of every joint, kg m2; light wrists need it"""
     enable: Literal["at-start", "by-command"] | None = None
-    """when drives are asked for torque: at the start, or by `rack command RACK servo enable`;
+    """when drives are enabled: at the start, or by `rack command RACK servo enable`;
     default: at-start for the simulated arm, by-command for every other"""
     bring_up: Positive | None = Field(None, le=1.0)
-    """part of full speed at which the arm moves until `rack command RACK servo release`; default:
-    full speed from the start"""
+    """fraction of full speed at which the arm moves until `rack command RACK servo release`;
+    default: full speed from the start"""
     guessed: tuple[str, ...] = ()
-    """keys of this table whose values were guessed, as in gripper.force: an arm that is not
-    simulated is not enabled before each is confirmed, by removing it here"""
+    """keys of this table whose values were guessed, such as gripper.force; an arm that is not
+    simulated is not enabled until each is confirmed by removing it here"""
 
     def misfits(self) -> Iterator[tuple[str, Any, str]]:
         """Yield key, values and reason for every list that does not have one value per joint."""
@@ -458,7 +458,7 @@ class PushConfig(Table):
     force: Vector
     """force at the centre of mass, in the world's frame, N"""
     rise: NotNegative = 0.0
-    """time in which it rises, and in which it falls at its end, s"""
+    """time in which the force rises at the start and falls at the end, s"""
 
 
 class GoalConfig(Table):
@@ -474,7 +474,7 @@ class GoalConfig(Table):
     # A gripper centres a part across its pads, but not along them. In that direction the part keeps
     # its offset, or slips.
     tolerance_mm: Positive = 10.0
-    """distance from there at which the task still counts as done, mm"""
+    """distance from the goal within which the task counts as done, mm"""
 
 
 class SceneConfig(Table):
@@ -485,7 +485,7 @@ class SceneConfig(Table):
     obstacles: tuple[str, ...] = ()
     """mocap bodies that may move by themselves"""
     supports: tuple[str, ...] = ()
-    """geoms on which objects may stand, and a tool on a wrist sensor may press"""
+    """geoms on which objects may stand, and on which a tool on a wrist sensor may press"""
     clearance: Positive = 0.015
     """distance that planned motion keeps from everything, m"""
     motion: tuple[MotionConfig, ...] = ()
@@ -493,7 +493,7 @@ class SceneConfig(Table):
     push: tuple[PushConfig, ...] = ()
     """forces on objects, by time"""
     goal: tuple[GoalConfig, ...] = ()
-    """where objects end, if the task is done"""
+    """where objects are when the task is done"""
 
     @property
     def bodies(self) -> tuple[str, ...]:
