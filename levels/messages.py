@@ -92,26 +92,26 @@ def per_joint(unit: str, doc: str) -> Any:
 class ElementalMove(Message, version=1):
     """One elemental move of a program."""
 
-    id: int = integer("serial of the move, rising by one from 1; 0: empty")
+    id: int = integer("serial of the move, rising by one from 1 (0: empty)")
     action: int = integer("index of the program's action that it serves", "u2")
     verb: Verb = field(doc="what to do")
-    object: int = integer("row of the object concerned in the world model; -1: none", "i2")
+    object: int = integer("row of the object concerned in the world model (-1: none)", "i2")
     position: ndarray = field(unit="m", doc="tool position at the end", shape=3)
     quaternion: ndarray = field(unit="1", doc="tool orientation at the end", shape=4)
     joints: ndarray = per_joint("rad", "where MOVE_JOINTS ends; with `posture`, near the end")
-    posture: bool = field(
-        doc="1: of the configurations at the pose, the one nearest to `joints` is wanted"
-    )
-    by: float = field(unit="s", doc="simulated time by which it must be done; 0: any time")
+    posture: bool = field(doc="1: select the configuration nearest to `joints` at the pose")
+    by: float = field(unit="s", doc="simulated time by which it must be done (0: any time)")
 
 
 class TaskPlan(Message, version=1):
     """The task level's plan, from planner to executor: the program as elemental moves."""
 
     id: int = integer("serial of the plan")
-    error: Error = field("u2", doc="why the program is refused; 0: it is not refused")
+    error: Error = field("u2", doc="why the program is refused (0: not refused)")
     reason: str = field(doc="the refusal, readable")
-    earliest: float = field(unit="s", doc="with TOO_LATE: the earliest time that could be met")
+    earliest: float = field(
+        unit="s", doc="with TOO_LATE: the earliest time at which it could be done"
+    )
     count: int = integer("moves that follow", "u2")
     moves: ndarray = field(ElementalMove, doc="the program, decomposed", shape=MOVES)
 
@@ -132,27 +132,25 @@ class TaskStatus(AnsweringStatus, version=2):
     moves_done: int = integer("elemental moves done", "u2")
     moves: int = integer("elemental moves of the plan; 0 before there is one", "u2")
     first: int = integer("id under which the plan's first move is handed down")
-    detour: int = integer("id of the move that an operator wants instead; 0: none")
+    detour: int = integer("id of the move that an operator requested instead (0: none)")
 
 
-OPERATED = field(doc="1: an operator keeps this level, or one below it, from its own work")
+OPERATED = field(doc="1: an operator keeps this level, or one below it, from its normal work")
 
 
 class MoveStatus(AnsweringStatus, version=3):
     """Status of the elemental move level."""
 
-    done: int = integer("newest elemental move done; 0: none yet")
-    current: int = integer("elemental move under way; 0: none")
+    done: int = integer("newest elemental move done (0: none yet)")
+    current: int = integer("elemental move under way (0: none)")
     progress: float = field(unit="1", doc="part of its path done, 0 to 1")
     verb: Verb = field(doc="of the move under way")
-    held: int = integer("row of the object in the gripper; -1: none", "i2")
-    planned: int = integer("newest elemental move whose path is ready; 0: none yet")
+    held: int = integer("row of the object in the gripper (-1: none)", "i2")
+    planned: int = integer("newest elemental move whose path is ready (0: none yet)")
     end: ndarray = per_joint("rad", "joint positions at the end of that path")
-    replan: int = integer(
-        "open request to plan the current move anew from `start`; 0: none is open"
-    )
+    replan: int = integer("open request to replan the current move from `start` (0: none)")
     start: ndarray = per_joint("rad", "joint positions where that motion holds")
-    replans: int = integer("plans made anew because something was in the way")
+    replans: int = integer("number of replans because of an obstacle")
     operated: bool = OPERATED
     resting: bool = field(
         doc="1: the arm rests, and the level that moves it has the operator's newest command"
@@ -163,8 +161,8 @@ class MovePlan(Message, version=1):
     """The elemental move level's plan, from planner to executor: a path for one move."""
 
     move: int = integer("elemental move that the plan serves")
-    replan: int = integer("request that it answers; 0: the first plan of the move")
-    error: Error = field("u2", doc="why there is no plan; 0: there is")
+    replan: int = integer("request that it answers (0: the first plan of the move)")
+    error: Error = field("u2", doc="why there is no plan (0: there is a plan)")
     reason: str = field(doc="the error, readable")
     kind: SegmentKind = field(doc="path or gripper")
     count: int = integer("waypoints that follow", "u2")
@@ -181,10 +179,10 @@ class MovePlan(Message, version=1):
 class MoveSegment(Message, version=1, message="segment"):
     """One segment of a move: a path, or a motion of the gripper."""
 
-    id: int = integer("serial of the segment, rising by one from 1; 0: empty")
+    id: int = integer("serial of the segment, rising by one from 1 (0: empty)")
     move: int = integer("elemental move that it serves")
     kind: SegmentKind = field(doc="path or gripper")
-    object: int = integer("object held, or to be grasped; -1: none", "i2")
+    object: int = integer("object held, or to be grasped (-1: none)", "i2")
     touch: bool = field(doc="1: the object may touch supports and fingers (approach, depart)")
     count: int = integer("waypoints that follow", "u2")
     waypoints: ndarray = field(
@@ -193,7 +191,7 @@ class MoveSegment(Message, version=1, message="segment"):
         shape=(WAYPOINTS, "joints"),
     )
     blend: ndarray = field(unit="rad", doc="length over which corner k is rounded", shape=WAYPOINTS)
-    by: float = field(unit="s", doc="simulated time by which it must be done; 0: any time")
+    by: float = field(unit="s", doc="simulated time by which it must be done (0: any time)")
     opening: float = field(unit="m or rad", doc="gripper joint position to go to, for GRIPPER")
     force: float = field(unit="N or N m", doc="largest gripper force on the way and afterwards")
 
@@ -209,20 +207,22 @@ class MoveCommand(RelayedCommand, version=2):
 class PrimitiveStatus(AnsweringStatus, version=3):
     """Status of the primitive level."""
 
-    done: int = integer("newest segment done; 0: none yet")
-    current: int = integer("segment under way; 0: none")
+    done: int = integer("newest segment done (0: none yet)")
+    current: int = integer("segment under way (0: none)")
     progress: float = field(unit="1", doc="part of the segment's path done, 0 to 1")
-    blocked: bool = field(doc="1: motion holds because something is in the way")
+    blocked: bool = field(doc="1: motion holds because of an obstacle")
     resting: bool = field(doc="1: commanded velocity is zero")
     operated: bool = OPERATED
-    held: int = integer("row of the object in the gripper; -1: none", "i2")
+    held: int = integer("row of the object in the gripper (-1: none)", "i2")
     opening: float = field(unit="m or rad", doc="gripper joint position, measured")
     position: ndarray = per_joint("rad", "joint positions commanded last")
-    earliest: float = field(unit="s", doc="with TOO_LATE: the earliest time that could be met")
-    ends: float = field(
-        unit="s", doc="simulated time at which the segment under way should be done; 0: not known"
+    earliest: float = field(
+        unit="s", doc="with TOO_LATE: the earliest time at which it could be done"
     )
-    wants: int = integer("segment for which the level wants a trajectory of its planner; 0: none")
+    ends: float = field(
+        unit="s", doc="simulated time at which the segment under way should be done (0: not known)"
+    )
+    wants: int = integer("segment for which the planner is to compute a trajectory (0: none)")
     begin: float = field(
         unit="rad", doc="path parameter at which that trajectory is to begin, from rest"
     )
@@ -232,7 +232,7 @@ class TrajectoryPlan(Message, version=1, message="trajectory"):
     """The primitive level's plan, from planner to executor: the timing of a path."""
 
     segment: int = integer("segment that it serves")
-    error: Error = field("u2", doc="why there is none; 0: there is")
+    error: Error = field("u2", doc="why there is no trajectory (0: there is one)")
     reason: str = field(doc="the error, readable")
     begin: float = field(unit="rad", doc="path parameter at which it begins")
     duration: float = field(unit="s", doc="from rest to rest")
@@ -251,14 +251,14 @@ class JointCommand(RelayedCommand, version=2, message="joint_set_point"):
     """Command from the primitive level to the servo level: a joint set point and its due tick."""
 
     due: int = field(
-        unit="tick", doc="tick at which the arm should be there; 0: no set point yet, hold"
+        unit="tick", doc="tick at which the set point applies (0: no set point yet, hold)"
     )
     position: ndarray = per_joint("rad", "joint positions")
     velocity: ndarray = per_joint("rad/s", "joint velocities")
     acceleration: ndarray = per_joint("rad/s2", "joint accelerations")
     opening: float = field(unit="m or rad", doc="gripper joint position to go to")
     force: float = field(unit="N or N m", doc="largest gripper force")
-    held: int = integer("row of the object in the gripper; -1: none", "i2")
+    held: int = integer("row of the object in the gripper (-1: none)", "i2")
 
 
 class ArmSetPoint(Protocol):
@@ -279,7 +279,7 @@ class ServoPlan(Message, version=1):
         doc="joint-space inertia, the object held included",
         shape=("joints", "joints"),
     )
-    held: int = integer("object included; -1: none", "i2")
+    held: int = integer("object included (-1: none)", "i2")
     payload_mass: float = field(unit="kg", doc="mass in the gripper")
     payload_offset: ndarray = field(unit="m", doc="its centre, in the frame of the tool", shape=3)
 
@@ -292,7 +292,7 @@ class DrivenArm(AnsweringStatus):
     torque: ndarray = per_joint(
         "N m", "torque given to the arm in this cycle, after the limit gate"
     )
-    target: ndarray = per_joint("rad", "where the joints are wanted in this cycle")
+    target: ndarray = per_joint("rad", "set point of the joints in this cycle")
     target_velocity: ndarray = per_joint("rad/s", "likewise")
     opening: float = field(unit="m or rad", doc="gripper joint position, measured")
     opening_velocity: float = field(unit="m/s or rad/s", doc="gripper joint velocity, measured")
@@ -324,7 +324,9 @@ class ArmState(Message, version=3):
     touches: int = integer("unintended contacts")
     violations: int = integer("substeps in which the arm broke a limit")
     pushed: int = integer("substeps in which a blow pushed a joint beyond a limit")
-    struck: int = field("i4", unit="tick", doc="ticks for which the motion is still that of a blow")
+    struck: int = field(
+        "i4", unit="tick", doc="ticks for which the motion is still attributed to a blow"
+    )
     waited: int = field("i4", unit="tick", doc="ticks since the last command")
     braked: bool = field(doc="1: the brakes are engaged")
     rest: ndarray = per_joint("rad", "where engaged brakes hold the joints")
@@ -335,7 +337,7 @@ class ArmState(Message, version=3):
         unit="tick",
         doc="ticks for which faults have kept the arm from its set points: see ArmParams.patience",
     )
-    error: Error = field("u2", doc="latched fault; 0: none")
+    error: Error = field("u2", doc="latched fault (0: none)")
     reason: str = field(doc="that fault, readable")
     state: ndarray = field(
         unit="", doc="of the simulated cell, see rack.levels.robot.engine", shape="state"
@@ -355,7 +357,7 @@ class WorldState(Message, version=1, message="world_model"):
     """Poses of bodies in the world model."""
 
     revision: int = integer(
-        "rises when a body starts to move and when it rests again; 0: nothing sensed"
+        "rises when a body starts to move and when it rests again (0: nothing sensed)"
     )
     position: ndarray = field(unit="m", doc="body origins", shape=("bodies", 3))
     quaternion: ndarray = field(unit="1", doc="body orientations", shape=("bodies", 4))

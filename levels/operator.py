@@ -93,7 +93,9 @@ class OperatorCommand(Command, version=2):
     name: str = field(f"S{NAME_BYTES}", doc="what a setting sets, or the level's own command to do")
 
 
-RESTS_ON = integer("newest command of an operator, here or above, that this rests on; 0: none")
+RESTS_ON = integer(
+    "newest operator's command, at this level or above, on which this is based (0: none)"
+)
 
 
 class RelayedCommand(Command):
@@ -105,17 +107,17 @@ class RelayedCommand(Command):
 class SampledCommand(RelayedCommand):
     """Base class for commands that state the sample of arm or hand on which they are based."""
 
-    sampled: int = field(unit="tick", doc="tick of the status that it rests on; -1: none yet")
+    sampled: int = field(unit="tick", doc="tick of the status on which it is based (-1: none yet)")
 
 
 class AnsweringStatus(Status):
     """Base class for statuses that answer an operator."""
 
     operator: int = RESTS_ON
-    order: int = integer("command of an operator that this answers, new or not; 0: none yet")
+    order: int = integer("operator's command that this answers, new or not (0: none yet)")
     answer: Answer = field(doc="this level's answer to it")
     standing: Operation = field(
-        doc="operator's command in force; 0: none, the level does its own work"
+        doc="operator's operation in force (0: none, the level does its normal work)"
     )
     objection: str = field(f"S{REASON_BYTES}", doc="why it was refused, readable")
 

@@ -214,7 +214,7 @@ class TimedOutput(SentOutput[M]):
 
 
 class MadePorts(NamedTuple):
-    """Ports that a config creates, in addition to those that a class declares.
+    """Ports that a config creates, in addition to the ports that a class declares.
 
     `is_whole` is False if some are unknown.
     """

@@ -226,7 +226,7 @@ class FollowConfig(Table):
     joint: str
     """MJCF joint that follows the driven one"""
     ratio: Finite = 1.0
-    """motion of the joint divided by the motion of the driven joint, from the model's reference pose"""
+    """motion of the joint per motion of the driven joint, from the model's reference pose"""
 
 
 class GripperConfig(Table):
@@ -352,7 +352,7 @@ class RobotConfig(Table):
     tool_offset: ToolConfig | None = None
     """pose of the tool on the body that `tool` names; default: the body's own"""
     home: tuple[Finite, ...] = Field((), min_length=1)
-    """joint positions to which tasks return, and the simulated start, rad; default: those of the
+    """joint positions to which tasks return, and the simulated start, rad; default: the
     first keyframe"""
     start: tuple[Finite, ...] | None = None
     """where the simulated arm starts, rad; default: home"""
@@ -370,7 +370,7 @@ class RobotConfig(Table):
     """command that the drives accept in every cycle: torques, or set points of position or velocity
     for drives that close their control loops themselves, which the simulated arm does, too"""
     exclude: tuple[tuple[str, str], ...] = ()
-    """pairs of MJCF bodies whose contacts are ignored, in addition to those of the model"""
+    """pairs of MJCF bodies whose contacts are ignored, in addition to the model's exclusions"""
     gripper: GripperConfig | None = None
     """gripper, if the arm has one"""
     sensors: SensorConfig | None = None
