@@ -244,6 +244,6 @@ def test_a_config_whose_arm_cannot_be_guarded_is_refused_before_the_launch() -> 
     (mistake,) = refused.value.mistakes
     assert (mistake.place, mistake.value) == ("board.servo.params.arm", "hardware_arm:HardwareArm")
     assert mistake.why == (
-        "robot.sensors: 'kj1' may be off by 0.00035 rad, 0.0035 rad/s, which is too coarse to keep it"
-        " below 0.001 rad/s; it must be less than half of that"
+        "robot.sensors: 'kj1' may be off by 0.00035 rad, 0.0035 rad/s, which is too coarse to keep"
+        " it below 0.001 rad/s; it must be less than half of that"
     )
