@@ -279,7 +279,7 @@ def restore_state(model: mujoco.MjModel, data: mujoco.MjData, state: Array) -> N
     view_state(model, data, state)
     asleep = state[state.size - model.ntree :]
     if (asleep >= 0).any():
-        # Steps do not compute quantities of sleeping bodies, so compute them once while all are awake.
+        # Steps skip quantities of sleeping bodies, so compute them once while all are awake.
         mujoco.mj_forward(model, data)
         view_state(model, data, state)
     data.tree_asleep[:] = asleep
