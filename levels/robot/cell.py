@@ -1,4 +1,4 @@
-"""The cell: a robot and its surroundings, as one MuJoCo model and the indices into it."""
+"""The cell: a robot and its surroundings, as one MuJoCo model with indices into it."""
 
 from __future__ import annotations
 
@@ -32,21 +32,21 @@ from rack.levels.robot.wrist import Wrist, find_wrist
 from rack.levels.tables import GripperConfig, Interface, RobotConfig, SceneConfig, SensorConfig
 
 TOUCHING_M = 5e-5
-"""Geoms closer than this at home touch: rounding decides."""
+"""Distance below which geoms at home count as touching, because rounding decides."""
 SETTLING_S = 1.0
-"""Time in which the fingers of a gripper come to rest."""
+"""Time in which the fingers of a gripper come to rest, s."""
 
 
 @dataclass(frozen=True)
 class Gripper:
     """An arm's gripper, driven at one joint. Indices are addresses in the model."""
 
-    dof: int  # the driven joint in qvel
+    dof: int  # address of the driven joint in qvel
     actuator: int
     open: float  # joint position, m or rad
-    closed: float  # joint position when closed without a part, m or rad
+    closed: float  # joint position when closed without an object, m or rad
     stiffness: float  # of the gripper's position loop, N/m or N m/rad
-    linkage: Linkage  # positions of all its joints, by its opening
+    linkage: Linkage  # positions of all its joints as functions of its opening
 
 
 class CellGeoms(NamedTuple):
@@ -95,34 +95,43 @@ class Cell:
     geoms: CellGeoms
 
     def start(self) -> mujoco.MjData:
-        """Return data of the start: the gripper is open, objects are where the model puts them."""
+        """Return MuJoCo data of the start.
+
+        The gripper is open, and objects are where the model places them.
+        """
         data = mujoco.MjData(self.model)
         mujoco.mj_resetDataKeyframe(self.model, data, 0)
         mujoco.mj_forward(self.model, data)
         return data
 
     def parts(self, row: int) -> Ints:
-        """Return the geoms of an object or obstacle, by its row in `bodies`."""
+        """Return the geoms of an object or obstacle, given its row in `bodies`."""
         model = self.model
         return np.flatnonzero(model.body_rootid[model.geom_bodyid] == self.bodies[row])
 
 
 def build_cell(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> Cell:
-    """Build the cell; one tick of `clock_ns` is `robot.substeps` MuJoCo steps. Each caller gets a
-    model of its own.
+    """Build the cell of a rack.
 
-    The crate builds it once, before it forks the boards; in the same process only the model is
-    copied from then on.
+    The crate builds it once, before it forks the boards. Later calls in the same process only copy
+    the model. Each caller gets a separate model.
 
-    Raises `RobotError`, one line, for a file, joint, site, body or geom that is missing or of the
-    wrong kind, a list of the wrong length, a home outside the limits or in unintended contact.
+    Args:
+        robot: The `[robot]` table.
+        scene: The `[scene]` table.
+        clock_ns: Duration of a tick, ns, which is `robot.substeps` MuJoCo steps.
+
+    Raises:
+        RobotError: A file, joint, site, body or geom is missing or of the wrong kind, a list has
+            the wrong length, or home is outside the limits or in unintended contact. The text is
+            one line.
     """
     cell = _compiled(robot, scene, clock_ns)
     return replace(cell, model=copy(cell.model))
 
 
 def cell_of(context: LevelContext) -> Cell:
-    """Build the cell of a level's rack. Raises as `build_cell`."""
+    """Build the cell of a level's rack; see `build_cell`."""
     return build_cell(context.robot, context.scene, context.clock_ns)
 
 
@@ -138,7 +147,16 @@ def _compiled(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> Cell:
 
 
 def unchecked_cell(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> Cell:
-    """Build the cell as `build_cell` does, wherever the arm is at home. Raises `RobotError`."""
+    """Build the cell like `build_cell`, without checking the start and the gripper.
+
+    Args:
+        robot: The `[robot]` table.
+        scene: The `[scene]` table.
+        clock_ns: Duration of a tick, ns.
+
+    Raises:
+        RobotError: As for `build_cell`.
+    """
     spec = load_spec(robot.model)
     check_joints(robot, spec)
     if robot.hand is None:
@@ -156,14 +174,15 @@ def unchecked_cell(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> Cel
 
 
 def sensed_by(cell: Cell, robot: RobotConfig, sensors: SensorConfig) -> Cell:
-    """Return the cell with encoders of `sensors`, unless `[robot.sensors]` says what they are."""
+    """Return the cell with the encoders `sensors`, unless `[robot.sensors]` states others."""
     tick_s = robot.substeps * cell.model.opt.timestep
     return replace(cell, encoders=Encoders.of(robot, tick_s, sensors))
 
 
 def sizes(cell: Cell) -> dict[str, int]:
-    """Return the sizes that the cell gives to messages: joints, bodies (at least 1), state; fingers
-    of a hand.
+    """Return the symbolic sizes of messages in this cell.
+
+    They are "joints", "bodies" (at least 1), "state", and "fingers" for a hand.
     """
     found = {
         "joints": len(cell.qpos),
@@ -287,22 +306,22 @@ def full_speed_energy(model: mujoco.MjModel, joints: Ints, robot: RobotConfig) -
 def find_gripper(
     model: mujoco.MjModel, robot: RobotConfig, moved: Mask, arm: Ints
 ) -> tuple[Gripper | None, Mask]:
-    """Return the gripper, and mark its bodies.
+    """Find the gripper and its bodies.
 
-    These are the body that carries its linkage, and all below it: the driven joint may be anywhere
-    in the linkage.
+    The bodies are the body that carries the linkage and all its descendants. The driven joint may
+    be anywhere in the linkage.
 
     Args:
         model: The compiled model.
-        robot: The config.
-        moved: (nbody,), the bodies that the arm moves.
-        arm: The joints of the arm, none of which is part of the linkage.
+        robot: The `[robot]` table.
+        moved: The bodies that the arm moves, (nbody,).
+        arm: Joints of the arm, none of which is part of the linkage.
 
     Returns:
-        None and no body, if the arm has no gripper.
+        The gripper, and a mask of its bodies, (nbody,). None and no body if the arm has no gripper.
 
     Raises:
-        RobotError: The arm does not carry the gripper's joint, or its linkage cannot be solved.
+        RobotError: The arm does not carry the gripper's joint, or the linkage cannot be solved.
     """
     config = robot.gripper
     if config is None:
@@ -311,8 +330,8 @@ def find_gripper(
     joint = lookup.find(model, mujoco.mjtObj.mjOBJ_JOINT, name, "robot.gripper.joint")
     if name in robot.joints or not moved[model.jnt_bodyid[joint]]:
         raise RobotError(
-            f"robot.gripper.joint: '{name}' must be a joint that the arm carries, not one of the"
-            " arm's own"
+            f"robot.gripper.joint: '{name}' must be a joint that the arm carries, and not be in"
+            " robot.joints"
         )
     body = model.jnt_bodyid[joint]
     while (
@@ -334,8 +353,12 @@ def find_gripper(
 
 
 def unintended_contacts(data: mujoco.MjData, touch: Mask, within: float = 0.0) -> NDArray[np.int32]:
-    """Return the pairs of geoms, (n, 2), in unintended contact, or `within` a distance, m; `touch`
-    is that of `Cell`.
+    """Return the pairs of geoms that are in unintended contact, (n, 2).
+
+    Args:
+        data: Data of the model.
+        touch: See `CellGeoms`.
+        within: Distance below which geoms count as in contact, m.
     """
     contact = data.contact
     pairs: NDArray[np.int32] = contact.geom
@@ -343,12 +366,21 @@ def unintended_contacts(data: mujoco.MjData, touch: Mask, within: float = 0.0) -
 
 
 def ease_gripper(cell: Cell, spec: mujoco.MjSpec, config: GripperConfig, tick_s: float) -> bool:
-    """Change in `spec` what would keep the gripper from moving; return whether something did.
+    """Change the model where it would keep the gripper from moving.
 
-    Its links that overlap before its fingers meet, open or half open, do not touch: links meet at
-    their pins, and meshes are simulated by their hulls. A drive lighter than what the damping of
-    its loop stops within one tick would swing: it gets that inertia, as `min_armature` does for the
-    arm's joints.
+    Links that overlap when the gripper is open or half open, before its fingers meet, are excluded
+    from contact. They overlap because links meet at their pins, and because meshes are simulated by
+    their convex hulls. A drive whose inertia is too small for the damping of its loop would
+    oscillate. It gets the inertia that it lacks, as `min_armature` does for the joints of the arm.
+
+    Args:
+        cell: The cell, with a gripper.
+        spec: The model, which is changed.
+        config: The `[robot.gripper]` table.
+        tick_s: Duration of a tick, s.
+
+    Returns:
+        True if anything was changed.
     """
     model = cell.model
     gripper = cell.gripper
@@ -359,21 +391,23 @@ def ease_gripper(cell: Cell, spec: mujoco.MjSpec, config: GripperConfig, tick_s:
         gripper.linkage.set(data.qpos, opening)
         mujoco.mj_fwdPosition(model, data)
         contact = data.contact
-        ours = np.isin(contact.geom, cell.geoms.gripper).all(axis=1) & (contact.dist < 0.0)
-        overlaps |= {tuple(sorted(pair)) for pair in model.geom_bodyid[contact.geom[ours]].tolist()}
+        overlap = np.isin(contact.geom, cell.geoms.gripper).all(axis=1) & (contact.dist < 0.0)
+        bodies = model.geom_bodyid[contact.geom[overlap]]
+        overlaps |= {tuple(sorted(pair)) for pair in bodies.tolist()}
     names = [[model.body(body).name for body in pair] for pair in sorted(overlaps)]
     named = [pair for pair in names if all(pair)]
     for first, second in named:
         spec.add_exclude(bodyname1=first, bodyname2=second)
-    lacks = config.gains[1] * tick_s - float(model.dof_M0[gripper.dof])
-    if lacks > 0.0:
-        spec.joint(config.joint).armature += lacks
-    return bool(named) or lacks > 0.0
+    missing = config.gains[1] * tick_s - float(model.dof_M0[gripper.dof])  # kg or kg m2
+    if missing > 0.0:
+        spec.joint(config.joint).armature += missing
+    return bool(named) or missing > 0.0
 
 
 def start_qpos(cell: Cell, position: Array) -> Array:
-    """Return qpos of a start: arm at `position`, gripper and its linkage open, the rest as in the
-    model.
+    """Return qpos of a start, with the arm at `position`.
+
+    The gripper and its linkage are open, and all else is as in the model.
     """
     qpos = np.array(cell.model.qpos0)
     qpos[cell.qpos] = position
@@ -383,28 +417,37 @@ def start_qpos(cell: Cell, position: Array) -> Array:
 
 
 def check_start(cell: Cell, robot: RobotConfig, key: str, position: Array) -> None:
-    """Raise `RobotError` when the start at robot.`key` is outside the limits, too heavy to hold, in
-    unintended contact, or not finite.
+    """Check that the arm can start at a position.
+
+    Args:
+        cell: The cell, whose keyframe is at this position.
+        robot: The `[robot]` table.
+        key: Key of the position in the table, for the error.
+        position: The position, (joints,), rad.
+
+    Raises:
+        RobotError: The position is outside the limits, too heavy to hold, in unintended contact, or
+            has an acceleration that is not finite.
     """
     for name, q, (low, high) in zip(robot.joints, position, cell.limits.position, strict=True):
         if not low <= q <= high:
             raise RobotError(
-                f"robot.{key}: joint '{name}' at {q:g} rad; {low:g} to {high:g} is valid"
+                f"robot.{key}: joint '{name}' is at {q:g} rad; it must be {low:g} to {high:g}"
             )
     data = cell.start()
     if not np.isfinite(data.qacc).all():
         raise RobotError(
-            f"model '{robot.model}': acceleration at {key} is not finite; check masses, inertias,"
-            " gravity"
+            f"model '{robot.model}': the acceleration at {key} is not finite; check masses,"
+            " inertias, gravity"
         )
     load = np.abs(data.qfrc_bias - data.qfrc_passive)[cell.dof]
     for name, needed, limit in zip(robot.joints, load, cell.bounds.torque, strict=True):
         if needed > limit:
             raise RobotError(
-                f"robot.{key}: joint '{name}' carries {needed:.4g} N m there; its torque limit is"
+                f"robot.{key}: joint '{name}' needs {needed:.4g} N m to hold; its torque limit is"
                 f" {limit:g}"
             )
-    # Surfaces that meet at 0.0 mm do not touch yet, but in the first motion.
+    # Surfaces at a distance of 0.0 mm do not touch yet, but would in the first motion.
     near = copy(cell.model)
     set_margins(near, near.geom_margin + TOUCHING_M)
     data = replace(cell, model=near).start()
@@ -417,8 +460,13 @@ def check_start(cell: Cell, robot: RobotConfig, key: str, position: Array) -> No
 
 
 def check_fingers(cell: Cell, config: GripperConfig) -> None:
-    """Raise `RobotError` when couplings yield so far that open or closing fingers settle beyond
-    `config.residual` of where planning poses them, or the gripper does not close.
+    """Check that the gripper opens and closes, with fingers near where planning expects them.
+
+    Only grippers whose couplings yield are simulated.
+
+    Raises:
+        RobotError: The gripper does not open or close, or fingers settle farther than
+            `config.residual` from their planned pose.
     """
     gripper = cell.gripper
     if gripper is None or not gripper.linkage.yields:
@@ -437,7 +485,7 @@ def check_fingers(cell: Cell, config: GripperConfig) -> None:
             mujoco.mj_step(model, data)
         if not abs(opening - wanted) <= abs(start - wanted) + config.still:
             raise RobotError(
-                f"robot.gripper.force: {config.force:g} does not bring the gripper from"
+                f"robot.gripper.force: {config.force:g} does not move the gripper from"
                 f" {start:.4g} to {wanted:.4g}: it settles at {opening:.4g}"
             )
         settled = data.geom_xpos[cell.geoms.gripper].copy()
@@ -446,8 +494,8 @@ def check_fingers(cell: Cell, config: GripperConfig) -> None:
         away = float(np.max(np.linalg.norm(data.geom_xpos[cell.geoms.gripper] - settled, axis=1)))
         if not away <= config.residual:
             raise RobotError(
-                f"robot.gripper: its couplings yield: at {opening:.4g} a finger settles"
-                f" {away * 1e3:.1f} mm from where planning poses it; robot.gripper.residual permits"
+                f"robot.gripper: couplings yield: at {opening:.4g} a finger settles"
+                f" {away * 1e3:.1f} mm from its planned pose; robot.gripper.residual permits"
                 f" {config.residual * 1e3:.1f} mm"
             )
 

@@ -115,7 +115,10 @@ def test_a_restarted_board_restores_it(rig: ServoRig) -> None:
             "rack.levels.arm:Sensed",
             "module 'rack.levels.arm' has no DrivableArm named 'Sensed'; it has: ",
         ),
-        ("tests.levels.arm.test_own_arm:HalfAnArm", "class 'HalfAnArm' does not implement: brake, step"),
+        (
+            "tests.levels.arm.test_own_arm:HalfAnArm",
+            "class 'HalfAnArm' does not implement: brake, step",
+        ),
     ],
 )
 def test_a_class_that_is_no_arm_is_refused_before_launch(reference: str, why: str) -> None:

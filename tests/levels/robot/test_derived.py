@@ -49,7 +49,9 @@ def test_joints_tool_and_home_come_from_actuators_sites_and_keyframe(tmp_path: P
 def test_a_model_without_actuators_must_have_its_joints_named(tmp_path: Path) -> None:
     text = MODEL.read_text()
     bare = text[: text.index("<actuator>")] + "</mujoco>"
-    with pytest.raises(ConfigError, match=r"robot\.joints: none named, and none in the model has"):
+    with pytest.raises(
+        ConfigError, match=r"robot\.joints: name the joints, because none in the model"
+    ):
         config(tmp_path, model=bare)
 
 

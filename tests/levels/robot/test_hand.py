@@ -18,7 +18,7 @@ CLOCK_NS = 500_000
 FLEXOR = '<general class="tendon" name="index0_flexor" tendon="index0_flexor"/>'
 TENDON = '<fixed name="index0_flexor"><joint joint="index0" coef="-.012"/></fixed>'
 NO_TENSION = (
-    "actuator 'index0_flexor' must pull a tendon, and nothing else, by its control, N: valid are a"
+    "actuator 'index0_flexor' must pull one tendon, with its control as tension, N: it needs a"
     " fixed gain of 1, no bias, a gear of -1, and a range from 0 or more to above robot.hand.least = 2"
 )
 EXTENSOR = '<fixed name="index0_extensor"><joint joint="index0" coef=".012"/></fixed>'
@@ -97,7 +97,7 @@ def test_the_palm_belongs_to_the_hand_and_may_touch_what_it_holds() -> None:
         (TENDON, TENDON.replace("-.012", ".012"), "on joint 'index0' are -0.012 to 0.012 m"),
         (EXTENSOR, EXTENSOR.replace(".012", "-.012"), "on joint 'index0' are -0.012 to 0.012 m"),
         (EXTENSOR, EXTENSOR.replace(".012", ".010"), "on joint 'index0' are 0.01 to 0.012 m"),
-        (TENDON, TENDON.replace("</fixed>", '<joint joint="index1" coef=".01"/></fixed>'), "tendon of joint 'index0' turns joint 'index1', too"),
+        (TENDON, TENDON.replace("</fixed>", '<joint joint="index1" coef=".01"/></fixed>'), "tendon of joint 'index0' also turns joint 'index1'"),
     ],
 )  # fmt: skip
 def test_a_tendon_that_is_no_half_of_a_pair_is_refused(
@@ -112,9 +112,12 @@ def test_a_tendon_that_is_no_half_of_a_pair_is_refused(
 @pytest.mark.parametrize(
     ("what", "why"),
     [
-        ({"least": 15.0}, "robot.hand.rest: 15 N; above robot.hand.least = 15 N is valid"),
-        ({"rest": 100.0}, "robot.hand.rest: 100 N; below the largest tension, 100 N, is valid"),
-        ({"flexors": ("index0_flexor",)}, "robot.hand.flexors: 1 values; one per joint: 16"),
+        ({"least": 15.0}, "robot.hand.rest: 15 N must be above robot.hand.least, 15 N"),
+        ({"rest": 100.0}, "robot.hand.rest: 100 N must be below the largest tension, 100 N"),
+        (
+            {"flexors": ("index0_flexor",)},
+            "robot.hand.flexors: has 1 values but needs 16, one per joint",
+        ),
     ],
 )
 def test_tensions_and_lists_that_do_not_fit_are_refused(what: dict[str, Any], why: str) -> None:

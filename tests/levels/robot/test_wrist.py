@@ -45,15 +45,15 @@ def test_what_hangs_on_the_sensor_may_touch_supports_and_nothing_else(tmp_path: 
         (
             {"torque": "wrist_force"},
             (
-                "robot.wrist.torque: sensor 'wrist_force' is no torque sensor; it has these torque"
+                "robot.wrist.torque: sensor 'wrist_force' is not a torque sensor; it has these torque"
                 " sensors: wrist_torque"
             ),
         ),
         (
             {"sites": ("sensor", "tcp")},
             (
-                "robot.wrist: force and torque are sensed at two sites, 'sensor' and 'tcp'; one is"
-                " valid"
+                "robot.wrist: force and torque are sensed at two sites, 'sensor' and 'tcp',"
+                " instead of one"
             ),
         ),
         (
@@ -62,15 +62,15 @@ def test_what_hangs_on_the_sensor_may_touch_supports_and_nothing_else(tmp_path: 
         ),
         (
             {"reach": 0.0},
-            "robot.wrist.force: sensor 'wrist_force' has no range; give it a cutoff, N",
+            "robot.wrist.force: sensor 'wrist_force' has no range; set its cutoff, N",
         ),
         (
             {"most_force": 151.0},
-            "robot.wrist.most_force: 151 N is beyond the sensor's range; at most 150 is valid",
+            "robot.wrist.most_force: 151 N is beyond the sensor's range; it must be at most 150",
         ),
         (
             {"most_torque": 25.0},
-            "robot.wrist.most_torque: 25 N m is beyond the sensor's range; at most 20 is valid",
+            "robot.wrist.most_torque: 25 N m is beyond the sensor's range; it must be at most 20",
         ),
     ],
 )
