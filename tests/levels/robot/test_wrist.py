@@ -45,8 +45,8 @@ def test_what_hangs_on_the_sensor_may_touch_supports_and_nothing_else(tmp_path: 
         (
             {"torque": "wrist_force"},
             (
-                "robot.wrist.torque: sensor 'wrist_force' is not a torque sensor; it has these torque"
-                " sensors: wrist_torque"
+                "robot.wrist.torque: sensor 'wrist_force' is not a torque sensor; it has these"
+                " torque sensors: wrist_torque"
             ),
         ),
         (

@@ -86,7 +86,7 @@ def test_the_monitor_says_what_it_stands(tmp_path: Path) -> None:
     exact = tolerance(cell)
     with pytest.raises(
         RobotError,
-        match=r"robot.sensors.noise: has 3 values but needs one for all joints, or one per joint: 2",
+        match=r"robot.sensors.noise: has 3 values but needs one for all joints, or one per joint",
     ):
         build_cell(
             pendulum(tmp_path, sensors=SensorConfig(noise=(0.1, 0.1, 0.1))), SceneConfig(), CLOCK_NS

@@ -68,11 +68,11 @@ def test_actions_of_every_kind_are_read() -> None:
         ({"do": "goto"}, "task.action[0]: a goto has either position or joints"),
         (
             {"do": "goto", "joints": [0, 0]},
-            "task.action[0].joints = [0.0, 0.0]: 2 values; permitted: 6, one per joint",
+            "task.action[0].joints = [0.0, 0.0]: has 2 values but needs 6, one per joint",
         ),
         (
             {"do": "goto", "position": [0, 0, 1], "direction": [0, 0, 0]},
-            "task.action[0]: direction is all zero; its length must not be zero",
+            "task.action[0]: direction is zero; its length must not be zero",
         ),
         (
             {"do": "goto", "position": [0, 0, float("nan")]},
@@ -88,7 +88,7 @@ def test_each_mistake_is_one_line_with_place_value_and_what_is_valid(
 
 def test_transfer_needs_a_gripper() -> None:
     robot, scene = config("k1607")
-    with pytest.raises(ProgramError, match="the robot has no gripper; permitted: goto, home"):
+    with pytest.raises(ProgramError, match="the robot has no gripper; valid actions: goto, home"):
         read_program(
             {"action": [{"do": "transfer", "object": "peg", "to": [0, 0, 0]}]}, robot, scene
         )
