@@ -104,8 +104,8 @@ class BrakedArm(Plant, DrivableArm):
     def refused(self, torque: Array) -> Finding | None:
         """Return why a torque must not be applied. None if it may be applied.
 
-        A torque that is NaN, infinite or beyond a limit is refused. The refusal is counted and
-        reported here; the caller has to brake. `torque` is (joints,), N m.
+        A torque that is NaN, infinite or beyond a limit is refused. The method counts
+        and reports the refusal; the caller has to engage the brakes. `torque` is (joints,), N m.
         """
         if np.count_nonzero(np.abs(torque) <= self._permitted) == torque.size:
             return None

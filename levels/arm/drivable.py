@@ -16,7 +16,7 @@ from rack.levels.tables import Interface, SceneConfig, SensorConfig, named_class
 
 
 class DriveState(IntEnum):
-    """State of an arm's drives: the states of CiA 402, reduced to those that levels distinguish."""
+    """State of an arm's drives: the CiA 402 states, reduced to what levels distinguish."""
 
     DISABLED = 0  # up to "switched on", without a request: no power, brakes engaged
     ENABLING = 1  # on the way to "operation enabled", including homing
@@ -69,7 +69,7 @@ class Link(Protocol):
     def drive(self, torque: Array, grip_force: float) -> Finding | None:
         """Release the brakes and apply torques for one torque cycle.
 
-        A torque that must not be applied (see `BrakedArm.check_torque`) engages the brakes.
+        A torque that must not be applied (see `BrakedArm.refused`) engages the brakes.
 
         Args:
             torque: (joints,), N m.

@@ -100,7 +100,7 @@ class Plant:
         self._reported_tick = self.tick
 
     def complete_cycle(self, state: ArmState | None) -> None:
-        """Report a cycle and fill its `ArmState`, unless the level has done so.
+        """Report a cycle and fill its `ArmState`, unless the level has already done it.
 
         `state` is None if the level publishes no such message.
         """

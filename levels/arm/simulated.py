@@ -40,8 +40,8 @@ class SimulatedArm(Simulation, Arm):
 
     Simulated time is always tick times period. Samples have the resolution and noise of the cell's
     encoders. Brakes and limit gate belong to the drives and use the true state. A command is for
-    one torque cycle. It passes the limit gate in every tick, even in those that the servo level
-    missed. Drives that follow set points (`[robot] interface`) compute a new torque in every tick.
+    one torque cycle. It passes the limit gate in every tick, even if the servo level missed
+    it. Drives that follow set points (`[robot] interface`) compute a new torque in every tick.
     Their state is in MuJoCo's user data.
     """
 

@@ -273,7 +273,7 @@ def sleeping(model: mujoco.MjModel, scene: SceneConfig) -> mujoco.MjModel:
 
 
 def restore_state(model: mujoco.MjModel, data: mujoco.MjData, state: Array) -> None:
-    """Set `data` so that its next steps equal those of the simulation that was saved."""
+    """Restore `data`, so that its next steps repeat the saved simulation bit for bit."""
     data.tree_asleep[:] = -1
     mj_update_sleep(model._address, data._address)
     view_state(model, data, state)

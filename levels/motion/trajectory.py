@@ -170,7 +170,7 @@ class Trajectory:
     """
 
     def __init__(self, sections: Array, duration: float) -> None:
-        # (n, 5), n >= 1: start time in s; then s, ds, dds, jerk of the path parameter there.
+        # (n, 5), n >= 1: start time in s; then s, ds, dds and jerk of the path parameter.
         self.sections = sections
         self.duration = duration  # s
         self.begin = float(sections[0, 1])  # path parameter at the start, rad

@@ -75,7 +75,7 @@ class Cell:
     begin: Array  # (joints,), rad: positions at the start
     tool: int  # site
 
-    # How the arm may move.
+    # Limits, sensors and drives of the arm.
     bounds: Bounds  # never exceeded, fault or not
     limits: Limits  # of planned motion
     encoders: Encoders  # resolution and noise of the joints' sensors
@@ -83,12 +83,12 @@ class Cell:
     interface: Interface  # of the drives
     homing: bool  # drives have to find their reference before they know their position
 
-    # What the arm carries.
+    # Devices that the arm carries.
     gripper: Gripper | None  # None for an arm without a gripper
     wrist: Wrist | None  # None for an arm without a force/torque sensor
     hand: Hand | None  # None for an arm
 
-    # Its surroundings.
+    # The surroundings.
     bodies: Ints  # objects, then obstacles, in the order of `scene.bodies`
     object_qpos: Ints  # (objects,), address of the first of the 7 coordinates of each object
     mocap: Ints  # (obstacles,), mocap ids

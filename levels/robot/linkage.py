@@ -164,7 +164,7 @@ class _Solver:
         return np.array(data.qpos)
 
     def _descend(self, yielding: bool) -> Array:
-        """Move the joints to the least sum of squared residuals; return the factored matrix there.
+        """Minimize the sum of squared residuals; return the factored matrix at the minimum.
 
         With `yielding`, every row is weighted by its stiffness in the simulation.
         """

@@ -44,7 +44,7 @@ class Spot(NamedTuple):
 
 
 class Way(NamedTuple):
-    """Where a transfer takes the object, and where it puts it down."""
+    """Spots at which a transfer takes the object and puts it down."""
 
     take: Spot
     put: Spot

@@ -176,7 +176,7 @@ WRONG_MODELS = {
     ),
     "no limit": (
         {"actuators": '<motor joint="shoulder"/>'},
-        "joint 'shoulder': the model gives no torque limit",
+        "joint 'shoulder': the model has no torque limit",
     ),
     "ball": (
         {

@@ -63,5 +63,5 @@ def test_a_tool_may_be_a_body_and_an_offset(tmp_path: Path) -> None:
     assert np.linalg.norm(ends[0] - ends[1]) == pytest.approx(0.1)
     with pytest.raises(Exception, match=r"no site 'tcp' in the model; it has: tip; bodies: world"):
         built_cell(config(tmp_path, 'tool = "tcp"'))
-    with pytest.raises(ConfigError, match=r"'velocities' is no key of \[robot\]"):
+    with pytest.raises(ConfigError, match=r"'velocities' is not a key of \[robot\]"):
         config(tmp_path, 'guessed = ["home", "velocities"]')

@@ -76,10 +76,10 @@ def test_the_palm_belongs_to_the_hand_and_may_touch_what_it_holds() -> None:
         name: made.model.geom(name).id
         for name in ("palm", "can", "stand", "index_pad", "thumb_pad")
     }
-    assert not made.touch[geom["palm"], geom["can"]]
-    assert not made.touch[geom["index_pad"], geom["thumb_pad"]]
-    assert not made.touch[geom["can"], geom["stand"]]
-    assert made.touch[geom["index_pad"], geom["stand"]]
+    assert not made.geoms.touch[geom["palm"], geom["can"]]
+    assert not made.geoms.touch[geom["index_pad"], geom["thumb_pad"]]
+    assert not made.geoms.touch[geom["can"], geom["stand"]]
+    assert made.geoms.touch[geom["index_pad"], geom["stand"]]
 
 
 @pytest.mark.parametrize(

@@ -41,7 +41,7 @@ def asset(text: str) -> str:
 
 
 STRIP = '<compiler strippath="true"/>'
-NUMBER = "valid: finite numbers"
+NUMBER = "it must be finite numbers"
 PARTS = f"more than {MOST_PARTS} bodies, joints, geoms and sites, with all replicas"
 REFUSED = {
     "replicate": (scene(f'<replicate count="100000">{PART}</replicate>'), PARTS),

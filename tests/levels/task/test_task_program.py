@@ -55,7 +55,7 @@ def test_actions_of_every_kind_are_read() -> None:
         ),
         (
             {"do": "transfer", "object": "peg"},
-            "task.action[0].to: missing; where the object's origin goes, m",
+            "task.action[0].to: missing; final position of the object's origin, m",
         ),
         (
             {"do": "home", "by": 0},

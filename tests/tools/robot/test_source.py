@@ -29,7 +29,7 @@ def refusal(folder: Path, text: str) -> str:
     return str(refused.value)
 
 
-VELOCITY = "must be a finite number, such as 2.5, from 0 to 1e+09"
+VELOCITY = "it must be a finite number, such as 2.5, from 0 to 1e+09"
 NUMBERS = {
     "comma": ('velocity="2"', 'velocity="2,5"', f"velocity = '2,5'; {VELOCITY}"),
     "empty": ('velocity="2"', 'velocity=""', f"velocity = ''; {VELOCITY}"),

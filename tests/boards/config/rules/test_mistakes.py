@@ -283,7 +283,7 @@ PARAMS = {
     "of the planner alone": (
         "nasrem",
         "task.params.settling=-1",
-        "= -1: should be greater than 0; from the end",
+        "= -1: should be greater than 0; longest time from the end",
     ),
 }
 
