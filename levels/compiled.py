@@ -194,13 +194,13 @@ class _Kept:
         code: bytes = dumps(result._reduce())  # type: ignore[no-untyped-call]
         try:
             path = self._path(types, result.codegen)
-            part = path.with_name(f"{path.name}.{os.urandom(8).hex()}")
+            partial_file = path.with_name(f"{path.name}.{os.urandom(8).hex()}")
             path.parent.mkdir(parents=True, exist_ok=True)
             try:
-                part.write_bytes(_digest(code) + code)
-                part.replace(path)
+                partial_file.write_bytes(_digest(code) + code)
+                partial_file.replace(path)
             finally:
-                part.unlink(missing_ok=True)
+                partial_file.unlink(missing_ok=True)
             for old in path.parent.glob(f"{self._name}-*"):
                 if not old.name.startswith(f"{self._name}-{self._source}-"):
                     old.unlink(missing_ok=True)

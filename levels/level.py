@@ -438,9 +438,9 @@ class Executor(LevelSection, ABC):
         kind = self.finding_kinds.get(name)
         subject = f"class {type(self).__name__}: finding '{name}' is"
         if kind is None:
-            near = get_close_matches(name, self.finding_kinds, 1)
+            matches = get_close_matches(name, self.finding_kinds, 1)
             known = ", ".join(self.finding_kinds) or "none"
-            hint = f"did you mean '{near[0]}'?" if near else f"declared: {known}"
+            hint = f"did you mean '{matches[0]}'?" if matches else f"declared: {known}"
             raise LevelError(f"{subject} not declared; {hint}")
         if unit and unit != kind.unit:
             raise LevelError(f"{subject} in {kind.unit}, not in {unit}")

@@ -145,7 +145,8 @@ BELOW_LOST = "no status from the level below: waiting for its board"
 def listed(commands: Commands) -> str:
     """Return the commands of a level as text, such as "hold, resume, goto joints|pose"."""
     return ", ".join(
-        f"{what.name.lower()} {goal_names(goals)}".rstrip() for what, goals in commands.items()
+        f"{operation.name.lower()} {goal_names(goals)}".rstrip()
+        for operation, goals in commands.items()
     )
 
 
@@ -237,7 +238,7 @@ class Orders:
                 if judge is not None:
                     judge(message)
             if self.in_force != replaced:
-                self._news = [told for told in self._news if told.serial != replaced]
+                self._news = [answer for answer in self._news if answer.serial != replaced]
         return taken
 
     def _take_up(self, message: OperatorCommand) -> bool:
@@ -246,23 +247,25 @@ class Orders:
             return False
         self._before = self.basis, self.standing, self._in_force
         self.serial = message.id
-        what = message.what
+        operation = message.what
         goal = message.goal
-        if what not in self._commands or goal not in (
-            self._commands[Operation(what)] or (Goal.NONE,)
+        if operation not in self._commands or goal not in (
+            self._commands[Operation(operation)] or (Goal.NONE,)
         ):
             self.refuse(
-                f"{described(what, goal)} is not a command of this level; permitted:"
+                f"{described(operation, goal)} is not a command of this level; permitted:"
                 f" {listed(self._commands)}"
             )
             return False
         self.basis = self.serial
-        is_done = what in (Operation.RESUME, Operation.RELEASE, *SETTINGS)
-        told = _Told(self.serial, Answer.DONE if is_done else Answer.TAKEN)
-        if what not in (*SETTINGS, *DRIVES):
-            self.standing = Operation.NONE if what == Operation.RESUME else Operation(what)
-            self._in_force = told
-        self._tell(told)
+        is_done = operation in (Operation.RESUME, Operation.RELEASE, *SETTINGS)
+        answer = _Told(self.serial, Answer.DONE if is_done else Answer.TAKEN)
+        if operation not in (*SETTINGS, *DRIVES):
+            self.standing = (
+                Operation.NONE if operation == Operation.RESUME else Operation(operation)
+            )
+            self._in_force = answer
+        self._tell(answer)
         return True
 
     def refuse(self, why: str) -> None:
@@ -303,13 +306,13 @@ class Orders:
         self._in_force = _Told(self.in_force, answer, why)
         self._tell(self._in_force)
 
-    def _tell(self, told: _Told) -> None:
+    def _tell(self, answer: _Told) -> None:
         """Queue an answer for the status. It replaces an older answer to the same command."""
         for at, waiting in enumerate(self._news):
-            if waiting.serial == told.serial:
-                self._news[at] = told
+            if waiting.serial == answer.serial:
+                self._news[at] = answer
                 return
-        self._news.append(told)
+        self._news.append(answer)
 
     def rests_on(self, above: int) -> int:
         """Return the newest operator's command on which this cycle is based.

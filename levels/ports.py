@@ -282,18 +282,18 @@ def collect_ports(level: type, attribute: str, kinds: tuple[type, ...]) -> dict[
     known: dict[str, Any] = {}
     for base in reversed(level.__mro__[1:]):
         known |= {port.name: port for port in vars(base).get(attribute, {}).values()}
-    found = dict(known)
+    ports = dict(known)
     for name, value in vars(level).items():
         if isinstance(value, kinds):
             if name not in known and any(hasattr(base, name) for base in level.__bases__):
                 why = f"{noun} '{name}' has the name of another attribute"
                 raise LevelError(f"class {level.__name__}: {why}; rename the {noun}")
             # A port that is declared again moves to the class's own ports.
-            found.pop(name, None)
-            found[name] = value
+            ports.pop(name, None)
+            ports[name] = value
         elif name in known and value is None:
-            del found[name]
+            del ports[name]
         elif name in known:
             why = f"attribute '{name}' has the name of a {noun}"
             raise LevelError(f"class {level.__name__}: {why}; rename the attribute")
-    return found
+    return ports

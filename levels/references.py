@@ -49,9 +49,9 @@ Configs of users and of recorded runs name the old places.
 def current(reference: str) -> str:
     """Return the present name of "package.module:Name"."""
     for old, new in MOVED.items():
-        rest = reference.removeprefix(old)
-        if rest != reference and rest[:1] in ("", ".", ":"):
-            return new + rest
+        remainder = reference.removeprefix(old)
+        if remainder != reference and remainder[:1] in ("", ".", ":"):
+            return new + remainder
     return reference
 
 
@@ -92,21 +92,21 @@ def find_class(reference: str, base: type[T], is_tried: bool = True) -> type[T]:
         LookupError: The class is missing, abstract, or no subclass of `base`.
     """
     module, name = module_and_name(reference, is_tried)
-    found = getattr(module, name, None)
-    if not isinstance(found, type) or not issubclass(found, base):
+    named = getattr(module, name, None)
+    if not isinstance(named, type) or not issubclass(named, base):
         kinds = [
             n
             for n, c in inspect.getmembers(module, inspect.isclass)
             if issubclass(c, base) and c is not base
         ]
-        what = "has no class" if found is None else f"has no {base.__name__} named"
+        problem = "has no class" if named is None else f"has no {base.__name__} named"
         raise LookupError(
-            f"module '{module.__name__}' {what} '{name}'; it has: {', '.join(kinds) or 'none'}"
+            f"module '{module.__name__}' {problem} '{name}'; it has: {', '.join(kinds) or 'none'}"
         )
-    if inspect.isabstract(found):
-        missing = ", ".join(sorted(getattr(found, "__abstractmethods__", ())))
+    if inspect.isabstract(named):
+        missing = ", ".join(sorted(getattr(named, "__abstractmethods__", ())))
         raise LookupError(f"class '{name}' does not implement: {missing}")
-    return found
+    return named
 
 
 # A config is checked for many mistakes, and each may need the module.

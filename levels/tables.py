@@ -97,7 +97,7 @@ def keys_of(kind: type[BaseModel]) -> dict[str, FieldInfo]:
 @cache
 def _texts_below(table: type[Table]) -> dict[str, str]:
     """Return the texts below the fields of a class in its source, by field."""
-    found = {}
+    texts = {}
     # A class typed at a prompt has no source.
     with suppress(OSError, TypeError):
         (declared,) = ast.parse(dedent(inspect.getsource(table))).body
@@ -105,8 +105,8 @@ def _texts_below(table: type[Table]) -> dict[str, str]:
         for pair in pairwise(declared.body):
             match pair:
                 case ast.AnnAssign(ast.Name(name)), ast.Expr(ast.Constant(str(text))):
-                    found[name] = " ".join(text.split())
-    return found
+                    texts[name] = " ".join(text.split())
+    return texts
 
 
 def frozen(value: Any) -> Any:
@@ -129,7 +129,7 @@ def read_params(kind: type[Params], params: Mapping[str, Any]) -> Params:
         return kind(**params)
     except ValidationError as error:
         first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"])
+        key = ".".join(str(key_part) for key_part in first["loc"])
         valid = ", ".join(kind.model_fields)
         raise LevelError(
             f"params.{key} = {first['input']!r}: {first['msg'].lower()}; keys: {valid}"

@@ -54,9 +54,9 @@ class LimitGate:
         """
         low, high = bounds.position.T
         fastest = SPEED_PART * bounds.velocity
-        kept = low + RANGE_KEPT_RAD, high - RANGE_KEPT_RAD
+        range_ends = low + RANGE_KEPT_RAD, high - RANGE_KEPT_RAD
         # In the row order of `is_clear`.
-        self._limits = np.stack((bounds.torque, fastest, *kept, braking, dynamics.dry))
+        self._limits = np.stack((bounds.torque, fastest, *range_ends, braking, dynamics.dry))
         self._torque, self._fastest, self._low, self._high, self._braking, _ = self._limits
         self._period_s = period_s
         self._dynamics = dynamics
@@ -82,14 +82,14 @@ class LimitGate:
         if self._is_clear(torque, self._dynamics.newest, self._limits, self._period_s):
             return torque, False
         passed: Array = np.clip(torque, -self._torque, self._torque)
-        least = -self._speed_towards(q - self._low, -qd) - qd
-        most = self._speed_towards(self._high - q, qd) - qd
-        gain = np.clip(self._gain(passed, q, qd), least, most)
+        lowest_gain = -self._speed_towards(q - self._low, -qd) - qd
+        highest_gain = self._speed_towards(self._high - q, qd) - qd
+        gain = np.clip(self._gain(passed, q, qd), lowest_gain, highest_gain)
         # Light joints change speed so much within a cycle that only the state in the middle of the
         # cycle predicts its end.
         gain = self._gain(passed, q + 0.5 * self._period_s * qd, qd + 0.5 * gain)
-        if (gain < least).any() or (gain > most).any():
-            passed = self._nearest(gain, least, most)
+        if (gain < lowest_gain).any() or (gain > highest_gain).any():
+            passed = self._nearest(gain, lowest_gain, highest_gain)
         return passed, not np.array_equal(passed, torque)
 
     def _gain(self, torque: Array, q: Array, qd: Array) -> Array:
@@ -98,24 +98,24 @@ class LimitGate:
         self._resisting = bias + self._dynamics.friction(qd)
         return np.asarray(solve(self._inertia, torque - self._resisting) * self._period_s)
 
-    def _nearest(self, gain: Array, least: Array, most: Array) -> Array:
+    def _nearest(self, gain: Array, lowest_gain: Array, highest_gain: Array) -> Array:
         """Return the torques whose velocity change is nearest to `gain` within bounds.
 
         Args:
             gain: Wanted velocity change in a cycle, (joints,), rad/s.
-            least: Lower bound of the change, rad/s.
-            most: Upper bound of the change, rad/s.
+            lowest_gain: Lower bound of the change, rad/s.
+            highest_gain: Upper bound of the change, rad/s.
         """
         scale = self._fastest
         per_torque = self._inertia * (scale / self._period_s) / self._torque[:, None]
         offset = self._resisting / self._torque
-        upper = np.concatenate((most / scale, 1.0 - offset))
-        lower = np.concatenate((least / scale, -1.0 - offset))
+        upper = np.concatenate((highest_gain / scale, 1.0 - offset))
+        lower = np.concatenate((lowest_gain / scale, -1.0 - offset))
         nearest, _, status, _ = daqp.solve(
             self._unity, -gain / scale, per_torque, upper, lower, self._kinds
         )
         if status < 0:
-            nearest = np.clip(gain, least, most) / scale
+            nearest = np.clip(gain, lowest_gain, highest_gain) / scale
         return np.asarray(
             np.clip(
                 (mat_vec(per_torque, nearest) + offset) * self._torque, -self._torque, self._torque
@@ -150,27 +150,27 @@ def is_clear(
     bias = evaluation[BIAS_ROW]
     inertia = evaluation[INERTIA_ROW:]
     most_torque, fastest, low, high, braking, dry = limits
-    left = torque - bias
+    net_torque = torque - bias
     for joint in range(len(q)):
         if not abs(torque[joint]) <= most_torque[joint]:
             return False
-        left[joint] -= dry[joint] * math.tanh(qd[joint] / FRICTION_SPEED)
-    twice = cholesky_solve(inertia, left) * (2.0 * period_s)
+        net_torque[joint] -= dry[joint] * math.tanh(qd[joint] / FRICTION_SPEED)
+    twice = cholesky_solve(inertia, net_torque) * (2.0 * period_s)
     for joint in range(len(q)):
         speed = fastest[joint]
-        hard = braking[joint]
-        room = CLEAR_PART * fastest[joint]
-        least = (
-            -speed_towards(q[joint] - low[joint], -qd[joint], speed, hard, period_s)
+        deceleration = braking[joint]
+        margin = CLEAR_PART * fastest[joint]
+        lowest = (
+            -speed_towards(q[joint] - low[joint], -qd[joint], speed, deceleration, period_s)
             - qd[joint]
-            + room
+            + margin
         )
-        most = (
-            speed_towards(high[joint] - q[joint], qd[joint], speed, hard, period_s)
+        highest = (
+            speed_towards(high[joint] - q[joint], qd[joint], speed, deceleration, period_s)
             - qd[joint]
-            - room
+            - margin
         )
-        if not (least <= 0.0 <= most and least <= twice[joint] <= most):
+        if not (lowest <= 0.0 <= highest and lowest <= twice[joint] <= highest):
             return False
     return True
 
@@ -183,10 +183,12 @@ def cholesky_solve(matrix: Array, vector: Array) -> Array:
     solution = vector.copy()
     for row in range(size):
         for column in range(row + 1):
-            rest = matrix[row, column]
+            remainder = matrix[row, column]
             for k in range(column):
-                rest -= factor[row, k] * factor[column, k]
-            factor[row, column] = np.sqrt(rest) if row == column else rest / factor[column, column]
+                remainder -= factor[row, k] * factor[column, k]
+            factor[row, column] = (
+                np.sqrt(remainder) if row == column else remainder / factor[column, column]
+            )
         for k in range(row):
             solution[row] -= factor[row, k] * solution[k]
         solution[row] /= factor[row, row]
@@ -214,8 +216,8 @@ def speed_towards(
         period_s: Cycle, s.
     """
     half = 0.5 * braking * period_s
-    left = np.maximum(distance - 0.5 * speed * period_s, 0.0)
-    stoppable = np.sqrt(half * half + 2.0 * braking * left) - half
+    remaining = np.maximum(distance - 0.5 * speed * period_s, 0.0)
+    stoppable = np.sqrt(half * half + 2.0 * braking * remaining) - half
     return np.minimum(stoppable, fastest)
 
 
@@ -255,10 +257,10 @@ class SetPointGate:
         self._period_s = arm.every * tick_s
         self._braking = cell.limits.acceleration
         self._by_position = cell.interface == "position"
-        kept = half_planned(bounds, cell.limits)
-        self._fastest = kept.velocity
+        narrowed = half_planned(bounds, cell.limits)
+        self._fastest = narrowed.velocity
         self._dynamics = Dynamics(cell)
-        self._gate = LimitGate(kept, self._braking, span_s, self._dynamics)
+        self._gate = LimitGate(narrowed, self._braking, span_s, self._dynamics)
         self._most = MOST_ACCELERATION * self._braking * self._period_s  # rad/s
         # No joint can reach a set point farther than this from its sensed position in a cycle.
         self._reach = self._fastest * self._period_s + cell.encoders.off
@@ -289,15 +291,15 @@ class SetPointGate:
         if refused is not None:
             arm.brake()
             return refused
-        wanted, is_cut = self._approached(target)
-        change = np.clip(wanted - velocity, -self._most, self._most)
+        wanted_velocity, is_cut = self._approached(target)
+        change = np.clip(wanted_velocity - velocity, -self._most, self._most)
         inertia, resisting = self._resisting()
         torque = mat_vec(inertia, change / self._period_s) + resisting
         passed, was_cut = self._gate.admit(torque, position, velocity)
         if was_cut:
             inertia, resisting = self._resisting()
             change = self._period_s * solve(inertia, passed - resisting)
-        arm.clipped += bool(is_cut or (change != wanted - velocity).any())
+        arm.clipped += bool(is_cut or (change != wanted_velocity - velocity).any())
         position += self._period_s * (velocity + 0.5 * change)
         velocity += change
         return JointTarget(position.copy(), velocity.copy(), target.torque)
@@ -307,15 +309,15 @@ class SetPointGate:
 
         While the arm is braked, or at the first set point, motion starts at the sensed state.
         """
-        away = target.position - q
-        wrong = ~np.isfinite(away + target.velocity)
+        error = target.position - q
+        is_invalid = ~np.isfinite(error + target.velocity)
         if self._arm.braked or np.isnan(self._last).any():
             self._last[:] = q, qd
-            wrong |= np.abs(away) > self._reach
-        if not wrong.any():
+            is_invalid |= np.abs(error) > self._reach
+        if not is_invalid.any():
             return None
-        joint = int(wrong.argmax())
-        return self._arm.refuse(Finding(Alarm.SET_POINT, joint, float(away[joint])))
+        joint = int(is_invalid.argmax())
+        return self._arm.refuse(Finding(Alarm.SET_POINT, joint, float(error[joint])))
 
     def _approached(self, target: JointTarget) -> tuple[Array, bool]:
         """Return the velocity to command for the end of the cycle, rad/s.
@@ -329,8 +331,8 @@ class SetPointGate:
         missing = target.position - position - 0.5 * period_s * (velocity + target.velocity)
         distance = np.abs(missing)
         at_rest = np.zeros(len(distance))
-        most = speed_towards(distance, at_rest, self._fastest, self._braking, period_s)
-        closing = np.copysign(np.minimum(distance / period_s, most), missing)
+        max_speed = speed_towards(distance, at_rest, self._fastest, self._braking, period_s)
+        closing = np.copysign(np.minimum(distance / period_s, max_speed), missing)
         # Within this distance `most` does not limit `closing`.
         cut = (distance > self._braking * period_s**2).any()
         return target.velocity + closing, bool(cut)
@@ -347,7 +349,7 @@ def half_planned(bounds: Bounds, limits: Limits) -> Bounds:
     They apply where they are tighter than `bounds`, because drives overshoot a little.
     """
     low, high = bounds.position.T
-    least, most = 0.5 * (bounds.position + limits.position).T
-    position = np.stack((np.maximum(low, least), np.minimum(high, most)), axis=1)
+    planned_low, planned_high = 0.5 * (bounds.position + limits.position).T
+    position = np.stack((np.maximum(low, planned_low), np.minimum(high, planned_high)), axis=1)
     fastest = np.minimum(bounds.velocity, 0.5 * (bounds.velocity + limits.velocity))
     return Bounds(position, fastest, bounds.torque)

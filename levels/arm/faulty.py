@@ -74,10 +74,10 @@ class FaultyLink:
         self._sensors = [(step, a) for step, a in steps if isinstance(step, SensorStep)]
         self._motors = [(step.part(a), a) for step, a in steps if isinstance(step, MotorStep)]
         self._commands = [(step, a) for step, a in steps if isinstance(step, CommandStep)]
-        most = np.full(len(self._limits), np.inf)
-        for part, weak in self._motors:
-            np.minimum(most, part * self._limits, out=most, where=weak.joints)
-        self._arm.weaken(most if self._motors else None)
+        max_torque = np.full(len(self._limits), np.inf)
+        for fraction, weak in self._motors:
+            np.minimum(max_torque, fraction * self._limits, out=max_torque, where=weak.joints)
+        self._arm.weaken(max_torque if self._motors else None)
 
     def _joints(self, fault: Fault) -> Mask:
         joints = np.arange(len(self._limits))
@@ -96,25 +96,25 @@ class FaultyLink:
         """Pass on torques with the faults applied."""
         if self._commands:
             torque = self._corrupt(torque)
-        found = self._next.drive(torque, grip_force)
+        finding = self._next.drive(torque, grip_force)
         self._show_motors()
-        return found
+        return finding
 
     def follow(self, target: JointTarget, grip_force: float) -> Finding | None:
         """Pass on set points, with command faults applied to the predicted torque."""
         if self._commands:
             target = target._replace(torque=self._corrupt(target.torque))
-        found = self._next.follow(target, grip_force)
+        finding = self._next.follow(target, grip_force)
         self._show_motors()
-        return found
+        return finding
 
     def _show_motors(self) -> None:
         """Record which motor faults had an effect, and whether it was detectable."""
         if self._motors and not self._arm.braked:
             asked = np.abs(self._arm.torque)
             hidden = self._hidden + self._pushed()
-            for part, active in self._motors:
-                missing = (asked - part * self._limits)[active.joints]
+            for fraction, active in self._motors:
+                missing = (asked - fraction * self._limits)[active.joints]
                 if (missing > 0.0).any():
                     self._acted[active.place] = bool((missing > hidden[active.joints]).any())
 

@@ -29,12 +29,12 @@ def kept_bounds(cell: Cell, part: float) -> Bounds:
     velocity = part * cell.bounds.velocity
     off = cell.encoders.off
     speed_off = cell.encoders.speed_off
-    kept = Bounds(
+    bounds = Bounds(
         position=cell.bounds.position + np.stack((off, -off), axis=1),
         velocity=velocity - speed_off,
         torque=cell.bounds.torque,
     )
-    coarse = (kept.velocity <= speed_off) | (kept.position[:, 0] >= kept.position[:, 1])
+    coarse = (bounds.velocity <= speed_off) | (bounds.position[:, 0] >= bounds.position[:, 1])
     if coarse.any():
         joint = int(coarse.argmax())
         name = "latency_ticks" if cell.encoders.latency_ticks else "sensors"
@@ -43,7 +43,7 @@ def kept_bounds(cell: Cell, part: float) -> Bounds:
             f" {speed_off[joint]:g} rad/s, which is too coarse to keep it below"
             f" {velocity[joint]:g} rad/s; it must be less than half of that"
         )
-    return kept
+    return bounds
 
 
 class GuardedArm:
@@ -89,15 +89,15 @@ class GuardedArm:
             RobotError: The encoders are too coarse to detect a violated limit.
         """
         cell = self._cell
-        kept = kept_bounds(cell, part)
+        bounds = kept_bounds(cell, part)
         off = cell.encoders.off
         self._low = cell.bounds.position[:, 0] - off
         self._high = cell.bounds.position[:, 1] + off
         self._fastest = part * cell.bounds.velocity + cell.encoders.speed_off
-        self._gate = LimitGate(kept, cell.limits.acceleration, self._span_s, self._dynamics)
+        self._gate = LimitGate(bounds, cell.limits.acceleration, self._span_s, self._dynamics)
         if cell.interface != "torque":
             last = self._last_set_point
-            self._set_points = SetPointGate(self._arm, kept, self._tick_s, self._span_s, last)
+            self._set_points = SetPointGate(self._arm, bounds, self._tick_s, self._span_s, last)
 
     def sense(self) -> Sensed:
         """Return the newest sample, after judging it."""
@@ -139,21 +139,21 @@ class GuardedArm:
     def _judge(self, sample: Sensed) -> None:
         q = sample.position
         # The conditions are negated so that NaN counts as a violation.
-        far = ~((q >= self._low) & (q <= self._high))
-        fast = ~(np.abs(sample.velocity) <= self._fastest)
-        if not (far.any() or fast.any()):
+        is_outside = ~((q >= self._low) & (q <= self._high))
+        is_too_fast = ~(np.abs(sample.velocity) <= self._fastest)
+        if not (is_outside.any() or is_too_fast.any()):
             self._arm.exceeded = None
             return
-        joint = int((far | fast).argmax())
-        if far[joint]:
+        joint = int((is_outside | is_too_fast).argmax())
+        if is_outside[joint]:
             value = float(q[joint])
             permitted = f"{self._low[joint]:g} to {self._high[joint]:g} rad"
-            what = f"position {value:.4g} rad"
+            quantity = f"position {value:.4g} rad"
         else:
             value = float(sample.velocity[joint])
             permitted = f"up to {self._fastest[joint]:g} rad/s"
-            what = f"velocity {value:.4g} rad/s"
-        text = f"{what} of joint '{self._cell.joints[joint]}' as sensed; permitted: {permitted}"
+            quantity = f"velocity {value:.4g} rad/s"
+        text = f"{quantity} of joint '{self._cell.joints[joint]}' as sensed; permitted: {permitted}"
         arm = self._arm
         finding = Finding(Alarm.LIMIT_EXCEEDED, joint, value)
         # An arm whose drives are not enabled may be moved by hand.

@@ -233,8 +233,10 @@ class SimulatedArm(Simulation, Arm):
         self.clipped += cut
         self._data.qfrc_applied[cell.dof] = passed if braked else 0.0
         np.copyto(self.torque, 0.0 if braked else passed)
-        given = self.torque if self._most is None else np.clip(self.torque, -self._most, self._most)
-        self._data.ctrl[cell.actuators] = given
+        motor_torque = (
+            self.torque if self._most is None else np.clip(self.torque, -self._most, self._most)
+        )
+        self._data.ctrl[cell.actuators] = motor_torque
         self._given = True
 
     def _braking_torque(self, q: Array, qd: Array) -> Array:
@@ -242,11 +244,14 @@ class SimulatedArm(Simulation, Arm):
 
         The brakes apply them even with the motors off.
         """
-        most = self.cell.limits.acceleration
+        max_acceleration = self.cell.limits.acceleration
         np.copyto(self._rest, q, where=np.abs(qd) > STANDSTILL)
-        wanted = BRAKE_BANDWIDTH**2 * (self._rest - q) - 2.0 * BRAKE_BANDWIDTH * qd
+        wanted_acceleration = BRAKE_BANDWIDTH**2 * (self._rest - q) - 2.0 * BRAKE_BANDWIDTH * qd
         inertia, bias = self.dynamics.terms(q, qd)
-        return np.asarray(mat_vec(inertia, np.clip(wanted, -most, most)) + bias)
+        return np.asarray(
+            mat_vec(inertia, np.clip(wanted_acceleration, -max_acceleration, max_acceleration))
+            + bias
+        )
 
 
 class CascadedDrives:
@@ -299,11 +304,11 @@ class CascadedDrives:
             waited: Ticks since the set point arrived.
         """
         position, velocity, integral = self._rows
-        now = position + (waited - self._every) * self._tick_s * velocity
-        slip = velocity + self._position_gain * (now - q) - qd
+        target = position + (waited - self._every) * self._tick_s * velocity
+        slip = velocity + self._position_gain * (target - q) - qd
         pull = VELOCITY_GAIN * mat_vec(self._dynamics.terms(q, qd).inertia, slip)
-        wanted = pull + integral
-        torque = np.asarray(np.clip(wanted, -self._limit, self._limit))
+        wanted_torque = pull + integral
+        torque = np.asarray(np.clip(wanted_torque, -self._limit, self._limit))
         # The integral stops while the torque is limited, to avoid windup.
-        integral += np.where(torque == wanted, INTEGRAL_GAIN * self._tick_s * pull, 0.0)
+        integral += np.where(torque == wanted_torque, INTEGRAL_GAIN * self._tick_s * pull, 0.0)
         return torque

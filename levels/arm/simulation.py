@@ -117,23 +117,23 @@ class Simulation(Plant):
             self._data.mocap_pos[mocap] = obstacle_position(start, moves, self._now_s)
         for body, pushes in self._pushes:
             self._data.xfrc_applied[body, :3] = push_force(pushes, self._now_s)
-        made = self._advance(0, self._after_s, *self._steps)
-        if made < 0:
-            self._look_closer(-made)
+        steps_made = self._advance(0, self._after_s, *self._steps)
+        if steps_made < 0:
+            self._look_closer(-steps_made)
         elif self.struck:
             self.struck -= 1
 
-    def _look_closer(self, made: int) -> None:
+    def _look_closer(self, steps_made: int) -> None:
         """Finish a tick in which step `made` failed a check.
 
         If the cause is a fault of the simulation, the state before the tick is restored.
         """
         touches = self.touches
         self._count_contacts()
-        while made < len(self._steps.seen):
-            made = self._advance(made, self._after_s, *self._steps)
-            if made < 0:
-                made = -made
+        while steps_made < len(self._steps.seen):
+            steps_made = self._advance(steps_made, self._after_s, *self._steps)
+            if steps_made < 0:
+                steps_made = -steps_made
                 self._count_contacts()
         if self.touches > touches and self.contact is not None:
             self.find(Finding(Alarm.COLLISION, *self.contact))
@@ -156,9 +156,9 @@ class Simulation(Plant):
             named = self.named(pairs[0])
             self.first_touch = f"unintended contact: {named} at {self._data.time:.3f} s"
         self.touches += len(pairs)
-        ours = pairs[self._ours()[pairs].any(axis=1)]
-        if len(ours):
-            self.contact = int(ours[0, 0]), int(ours[0, 1])
+        own_pairs = pairs[self._ours()[pairs].any(axis=1)]
+        if len(own_pairs):
+            self.contact = int(own_pairs[0, 0]), int(own_pairs[0, 1])
 
     def _held(self) -> Mask:
         """Return a mask of the geoms of free bodies that the gripper touches, (ngeom,)."""
@@ -181,27 +181,27 @@ class Simulation(Plant):
         seen = self._steps.seen
         low, high = self._steps.judged[:2]
         # The condition is negated so that NaN counts as a violation.
-        wrong = ~((seen >= low) & (seen <= high))
-        is_wrong = steps = wrong.any(axis=(1, 2))
+        violated = ~((seen >= low) & (seen <= high))
+        is_wrong = steps = violated.any(axis=(1, 2))
         if self.struck:
-            pushed = steps & ~wrong[:, 2].any(axis=1) & np.isfinite(seen).all(axis=(1, 2))
+            pushed = steps & ~violated[:, 2].any(axis=1) & np.isfinite(seen).all(axis=(1, 2))
             self.pushed += int(pushed.sum())
             steps = steps & ~pushed
         if steps.any():
             self.violations += int(steps.sum())
-            self._report_violation(wrong, int(steps.argmax()))
+            self._report_violation(violated, int(steps.argmax()))
         return bool(is_wrong.any())
 
-    def _report_violation(self, wrong: Mask, step: int) -> None:
+    def _report_violation(self, violated: Mask, step: int) -> None:
         """Report the first limit that `step` broke."""
-        part, joint = (int(at[0]) for at in np.nonzero(wrong[step]))
-        value = float(self._steps.seen[step, part, joint])
+        row, joint = (int(at[0]) for at in np.nonzero(violated[step]))
+        value = float(self._steps.seen[step, row, joint])
         if not self.first_violation:
-            what, unit = QUANTITIES[part]
+            quantity, unit = QUANTITIES[row]
             where = f"joint '{self.cell.joints[joint]}' at {self._now_s:.4f} s, step {step}"
-            low, high = self._steps.judged[:2, part, joint]
+            low, high = self._steps.judged[:2, row, joint]
             permitted = f"{low:g} to {high:g} is permitted"
-            self.first_violation = f"{what} {value:.6g} {unit} of {where}; {permitted}"
+            self.first_violation = f"{quantity} {value:.6g} {unit} of {where}; {permitted}"
         self.find(Finding(Alarm.LIMIT_EXCEEDED, joint, value))
 
     def _broken(self) -> str:
@@ -231,10 +231,10 @@ def obstacle_position(start: Array, moves: tuple[MotionConfig, ...], time_s: flo
     for move, end in zip(ordered, ends, strict=False):
         if time_s <= move.at:
             break
-        way = np.array(move.to) - place
-        length = norm(way)
+        offset = np.array(move.to) - place
+        length = norm(offset)
         driven = move.speed * (min(time_s, end) - move.at)
-        place = np.array(move.to) if driven >= length else place + way * (driven / length)
+        place = np.array(move.to) if driven >= length else place + offset * (driven / length)
     return place
 
 
@@ -242,12 +242,12 @@ def push_force(pushes: tuple[PushConfig, ...], time_s: float) -> Array:
     """Return the sum of the pushes on an object at simulated `time_s`, (3,), N."""
     total = np.zeros(3)
     for push in pushes:
-        since = time_s - push.at
-        left = push.at + push.seconds - time_s
-        if since >= 0.0 and left > 0.0:
+        elapsed_s = time_s - push.at
+        remaining_s = push.at + push.seconds - time_s
+        if elapsed_s >= 0.0 and remaining_s > 0.0:
             share = 1.0
             if push.rise > 0.0:
-                share = min(1.0, since / push.rise, left / push.rise)
+                share = min(1.0, elapsed_s / push.rise, remaining_s / push.rise)
             total += np.array(push.force) * share
     return total
 

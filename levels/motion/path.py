@@ -118,8 +118,8 @@ class BlendedPath:
 
         At a break this is the following piece.
         """
-        found = np.searchsorted(self.breaks, s, side="right") - 1
-        return np.clip(found, 0, len(self.breaks) - 2)
+        pieces = np.searchsorted(self.breaks, s, side="right") - 1
+        return np.clip(pieces, 0, len(self.breaks) - 2)
 
     def sample(self, step_rad: float) -> Array:
         """Return points along the path, including both ends, (n, joints), rad.

@@ -101,15 +101,17 @@ def speed_limits(piece: PathBounds, limits: Limits, share: float) -> SpeedLimits
             share * math.sqrt(least_ratio(acceleration, second)),
             share * math.cbrt(least_ratio(jerk, third)),
         )
-    left = np.maximum(acceleration - second * speed**2, 0.0)
-    left_jerk = np.maximum(jerk - third * speed**3, 0.0)
-    most = least_ratio(left, first)
+    acceleration_left = np.maximum(acceleration - second * speed**2, 0.0)
+    jerk_left = np.maximum(jerk - third * speed**3, 0.0)
+    max_acceleration = least_ratio(acceleration_left, first)
     if curved:
-        most = min(most, 0.5 * least_ratio(left_jerk, 3.0 * second * speed))
-    change = least_ratio(np.maximum(left_jerk - 3.0 * second * speed * most, 0.0), first)
-    if min(most, change) < MIN_ACCELERATION_PART * speed:
+        max_acceleration = min(max_acceleration, 0.5 * least_ratio(jerk_left, 3.0 * second * speed))
+    max_jerk = least_ratio(
+        np.maximum(jerk_left - 3.0 * second * speed * max_acceleration, 0.0), first
+    )
+    if min(max_acceleration, max_jerk) < MIN_ACCELERATION_PART * speed:
         return SpeedLimits(speed, 0.0, 0.0)
-    return SpeedLimits(speed, most, change)
+    return SpeedLimits(speed, max_acceleration, max_jerk)
 
 
 def reachable_speed(start: float, length: float, limits: SpeedLimits) -> float:
@@ -244,14 +246,16 @@ def make_stop(path: BlendedPath, limits: Limits, state: PathState) -> Trajectory
     if state.ds < MAX_REST_RAD_S:
         return _joined([], state.s)
     rate = path.bounds.first[path.pieces_at(state.s)]
-    most = least_ratio(limits.acceleration, rate)
-    jerk = least_ratio(limits.jerk, rate)
+    max_acceleration = least_ratio(limits.acceleration, rate)
+    max_jerk = least_ratio(limits.jerk, rate)
     # Motion must rest at a stop, because the path continues in another direction.
     end = (
         next((s for s in path.stops if s > state.s - COINCIDENT_RAD), path.length) + COINCIDENT_RAD
     )
-    for part, part_of_jerk in STOP_EFFORTS:
-        stop = _ramp(state, max(part * most, abs(state.dds)), part_of_jerk * jerk)
+    for fraction, jerk_fraction in STOP_EFFORTS:
+        stop = _ramp(
+            state, max(fraction * max_acceleration, abs(state.dds)), jerk_fraction * max_jerk
+        )
         if stop.end <= end and _keeps(stop, path, limits):
             return stop
     return None
@@ -272,19 +276,19 @@ def _fastest(path: BlendedPath, start: float, end: float, limits: Limits) -> lis
             ([start, end], PathBounds(*(bound.max(axis=0, keepdims=True) for bound in bounds)))
         )
     best: list[Section] = []
-    least = np.inf
+    least_time_s = np.inf
     for share in SHARES if corners else SHARES[:1]:
         for marks, pieces in candidates:
             stretches = [
                 speed_limits(PathBounds(*piece), limits, share)
                 for piece in zip(*pieces, strict=True)
             ]
-            rows = list(_sections(marks, stretches))
+            sections = list(_sections(marks, stretches))
             # `fsum` is exact, whereas `sum` rounds differently from Python 3.12 on.
-            time_s = math.fsum(row[0] for row in rows)
-            if time_s < least and len(rows) <= SECTIONS_A_LINE * (1 + corners):
-                best = rows
-                least = time_s
+            time_s = math.fsum(row[0] for row in sections)
+            if time_s < least_time_s and len(sections) <= SECTIONS_A_LINE * (1 + corners):
+                best = sections
+                least_time_s = time_s
     return best
 
 
@@ -299,44 +303,44 @@ def _sections(marks: Sequence[float], limits: Sequence[SpeedLimits]) -> Iterator
         marks, lengths, limits, pairwise(speeds), strict=False
     ):
         if limit.acceleration > 0.0:
-            wanted = _from(PathState(start, before, 0.0), limit.acceleration, limit.jerk)
-            wanted.target_position = [start + length]
-            wanted.target_velocity = [after]
-            wanted.max_velocity = [limit.speed]
-            yield from _calculated(wanted)
+            request = _from(PathState(start, before, 0.0), limit.acceleration, limit.jerk)
+            request.target_position = [start + length]
+            request.target_velocity = [after]
+            request.max_velocity = [limit.speed]
+            yield from _calculated(request)
         else:
             lasts_s = length / before if before > 0.0 else np.inf
             yield (lasts_s, start, before, 0.0, 0.0)
 
 
 def _ramp(state: PathState, acceleration: float, jerk: float) -> Trajectory:
-    wanted = _from(state, acceleration, jerk)
-    wanted.control_interface = ruckig.ControlInterface.Velocity
-    return _joined(_calculated(wanted), state.s)
+    request = _from(state, acceleration, jerk)
+    request.control_interface = ruckig.ControlInterface.Velocity
+    return _joined(_calculated(request), state.s)
 
 
 def _from(state: PathState, acceleration: float, jerk: float) -> ruckig.InputParameter:
     """Return the input of ruckig for motion from `state`, in one dimension."""
-    wanted = ruckig.InputParameter(1)
-    wanted.current_position = [state.s]
-    wanted.current_velocity = [state.ds]
-    wanted.current_acceleration = [state.dds]
-    wanted.max_acceleration = [acceleration]
-    wanted.max_jerk = [jerk]
-    return wanted
+    request = ruckig.InputParameter(1)
+    request.current_position = [state.s]
+    request.current_velocity = [state.ds]
+    request.current_acceleration = [state.dds]
+    request.max_acceleration = [acceleration]
+    request.max_jerk = [jerk]
+    return request
 
 
-def _calculated(wanted: ruckig.InputParameter) -> list[Section]:
+def _calculated(request: ruckig.InputParameter) -> list[Section]:
     """Return the sections of ruckig's result in one dimension.
 
     Raises:
         ArithmeticError: ruckig finds no solution.
     """
-    found = ruckig.Trajectory(1)
-    result = ruckig.Ruckig(1).calculate(wanted, found)
+    trajectory = ruckig.Trajectory(1)
+    result = ruckig.Ruckig(1).calculate(request, trajectory)
     if result != ruckig.Result.Working:
-        raise ArithmeticError(f"trajectory: ruckig returned {result} for {wanted}")
-    profile = found.profiles[0][0]
+        raise ArithmeticError(f"trajectory: ruckig returned {result} for {request}")
+    profile = trajectory.profiles[0][0]
     rows = zip(profile.t, profile.p, profile.v, profile.a, profile.j, strict=False)
     return [row for row in rows if row[0] > MIN_SECTION_S]
 
@@ -361,21 +365,24 @@ def _keeps(stop: Trajectory, path: BlendedPath, limits: Limits) -> bool:
     s, ds, dds = stop.states(times)
     jerk = np.abs(stop.sections[np.searchsorted(switches, times[:-1], side="right") - 1, 4])
     # In an interval dds is linear and keeps its sign, so values at the ends bound dds and ds.
-    most = np.maximum(np.abs(dds[:-1]), np.abs(dds[1:]))
+    acceleration = np.maximum(np.abs(dds[:-1]), np.abs(dds[1:]))
     speed = np.maximum(ds[:-1], ds[1:])
     first, second, third = _bounds_over(path, s)
     speed = speed[:, None]
-    most = most[:, None]
+    acceleration = acceleration[:, None]
     jerk = jerk[:, None]
     # The result of ** 3 on an array differs between processors.
     cubed = speed * speed * speed
-    room = 1.0 + LIMIT_ROUNDING
+    tolerance = 1.0 + LIMIT_ROUNDING
     # A jerk too small to end the present deceleration in time would reverse the motion.
     return bool(
         (ds > -LIMIT_ROUNDING).all()
-        and (first * speed <= limits.velocity * room).all()
-        and (second * speed**2 + first * most <= limits.acceleration * room).all()
-        and (third * cubed + 3.0 * second * speed * most + first * jerk <= limits.jerk * room).all()
+        and (first * speed <= limits.velocity * tolerance).all()
+        and (second * speed**2 + first * acceleration <= limits.acceleration * tolerance).all()
+        and (
+            third * cubed + 3.0 * second * speed * acceleration + first * jerk
+            <= limits.jerk * tolerance
+        ).all()
     )
 
 

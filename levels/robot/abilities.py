@@ -42,12 +42,12 @@ def abilities(cell: Cell) -> Abilities:
     """Compute the abilities of the arm of a cell, from many random poses and stretched out."""
     statics = Statics(cell)
     poses = statics.poses()
-    far = statics.stretched(max(poses, key=statics.distance))
-    found = [statics.held(position) for position in (*poses, far)]
-    left = np.min([parts for parts, _ in found], axis=0)
-    joint = int(left.argmin())
-    payload = max(0.0, min(mass for _, mass in found))
-    return Abilities(statics.distance(far), payload, float(left[joint]), joint)
+    stretched = statics.stretched(max(poses, key=statics.distance))
+    limits = [statics.held(position) for position in (*poses, stretched)]
+    torque_left = np.min([parts for parts, _ in limits], axis=0)
+    joint = int(torque_left.argmin())
+    payload = max(0.0, min(mass for _, mass in limits))
+    return Abilities(statics.distance(stretched), payload, float(torque_left[joint]), joint)
 
 
 class Statics:
@@ -103,10 +103,10 @@ class Statics:
         mujoco.mj_forward(self._model, data)
         mujoco.mj_jacSite(self._model, data, self._jacobian, None, cell.tool)
         torque = cell.bounds.torque
-        own = (data.qfrc_bias - data.qfrc_passive)[cell.dof]
+        gravity_torque = (data.qfrc_bias - data.qfrc_passive)[cell.dof]
         x, y, z = self._model.opt.gravity
         rows = self._jacobian[:, cell.dof]
         a_kg = -(x * rows[0] + y * rows[1] + z * rows[2])
         loaded = np.abs(a_kg) > 1e-9
-        room = (torque - np.sign(a_kg) * own)[loaded] / np.abs(a_kg[loaded])
-        return 1.0 - np.abs(own) / torque, float(room.min(initial=math.inf))
+        masses = (torque - np.sign(a_kg) * gravity_torque)[loaded] / np.abs(a_kg[loaded])
+        return 1.0 - np.abs(gravity_torque) / torque, float(masses.min(initial=math.inf))

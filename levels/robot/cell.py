@@ -184,12 +184,12 @@ def sizes(cell: Cell) -> dict[str, int]:
 
     They are "joints", "bodies" (at least 1), "state", and "fingers" for a hand.
     """
-    found = {
+    by_name = {
         "joints": len(cell.qpos),
         "bodies": max(1, len(cell.bodies)),
         "state": state_size(cell.model),
     }
-    return found if cell.hand is None else {**found, "fingers": len(cell.hand.names)}
+    return by_name if cell.hand is None else {**by_name, "fingers": len(cell.hand.names)}
 
 
 def assemble_cell(
@@ -448,9 +448,9 @@ def check_start(cell: Cell, robot: RobotConfig, key: str, position: Array) -> No
                 f" {limit:g}"
             )
     # Surfaces at a distance of 0.0 mm do not touch yet, but would in the first motion.
-    near = copy(cell.model)
-    set_margins(near, near.geom_margin + TOUCHING_M)
-    data = replace(cell, model=near).start()
+    padded = copy(cell.model)
+    set_margins(padded, padded.geom_margin + TOUCHING_M)
+    data = replace(cell, model=padded).start()
     for pair in unintended_contacts(data, cell.geoms.touch, TOUCHING_M):
         first, second = (lookup.geom_name(cell.model, geom) for geom in pair)
         raise RobotError(
@@ -473,29 +473,31 @@ def check_fingers(cell: Cell, config: GripperConfig) -> None:
         return
     model = cell.model
     stiffness, damping = config.gains
-    for wanted, start in ((config.open, config.open), (config.closed, half_open(config))):
+    for goal, start in ((config.open, config.open), (config.closed, half_open(config))):
         data = cell.start()
         gripper.linkage.set(data.qpos, start)
         for _ in range(round(SETTLING_S / model.opt.timestep)):
             data.qpos[cell.qpos] = cell.home
             data.qvel[cell.dof] = 0.0
             opening = float(data.qpos[gripper.linkage.driven])
-            pull = stiffness * (wanted - opening) - damping * data.qvel[gripper.dof]
+            pull = stiffness * (goal - opening) - damping * data.qvel[gripper.dof]
             data.ctrl[gripper.actuator] = np.clip(pull, -config.force, config.force)
             mujoco.mj_step(model, data)
-        if not abs(opening - wanted) <= abs(start - wanted) + config.still:
+        if not abs(opening - goal) <= abs(start - goal) + config.still:
             raise RobotError(
                 f"robot.gripper.force: {config.force:g} does not move the gripper from"
-                f" {start:.4g} to {wanted:.4g}: it settles at {opening:.4g}"
+                f" {start:.4g} to {goal:.4g}: it settles at {opening:.4g}"
             )
         settled = data.geom_xpos[cell.geoms.gripper].copy()
         gripper.linkage.set(data.qpos, float(data.qpos[gripper.linkage.driven]))
         mujoco.mj_kinematics(model, data)
-        away = float(np.max(np.linalg.norm(data.geom_xpos[cell.geoms.gripper] - settled, axis=1)))
-        if not away <= config.residual:
+        error_m = float(
+            np.max(np.linalg.norm(data.geom_xpos[cell.geoms.gripper] - settled, axis=1))
+        )
+        if not error_m <= config.residual:
             raise RobotError(
                 f"robot.gripper: couplings yield: at {opening:.4g} a finger settles"
-                f" {away * 1e3:.1f} mm from its planned pose; robot.gripper.residual permits"
+                f" {error_m * 1e3:.1f} mm from its planned pose; robot.gripper.residual permits"
                 f" {config.residual * 1e3:.1f} mm"
             )
 

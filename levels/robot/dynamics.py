@@ -82,10 +82,10 @@ class Dynamics:
         # than the arithmetic on it.
         self._evaluations = np.zeros((2, INERTIA_ROW + joints, joints))
         # The first is read only for users, the second includes the payload.
-        self.newest, given = self._evaluations
+        self.newest, current = self._evaluations
         self.newest[:STATE_ROWS] = np.nan  # not evaluated yet
-        self._terms = Terms(given[INERTIA_ROW:], given[BIAS_ROW])
-        self._position, self._velocity = given[:STATE_ROWS]
+        self._terms = Terms(current[INERTIA_ROW:], current[BIAS_ROW])
+        self._position, self._velocity = current[:STATE_ROWS]
         self._offset = np.zeros(3)
         at = self._model._address, d._address
         self._evaluating = *at, *addresses(self._model, d, cell), self._evaluations
@@ -93,7 +93,7 @@ class Dynamics:
         tool = (d.site_xpos[cell.tool], d.site_xmat[cell.tool])
         gravity = np.array(self._model.opt.gravity)
         jacobians = np.zeros((2, 3, cell.model.nv))
-        self._carrying = self._offset, *at, cell.dof, hand, *tool, gravity, jacobians, given
+        self._carrying = self._offset, *at, cell.dof, hand, *tool, gravity, jacobians, current
         self._evaluate = evaluate.load()
         self._carry = carry.load()
         self.dry = np.array(cell.model.dof_frictionloss[cell.dof])  # (joints,), N m: dry friction
@@ -138,13 +138,15 @@ def addresses(
         data.qpos, data.qvel, data.qfrc_bias, data.qfrc_passive, data.M
     )
     # MuJoCo stores the nonzero elements of the lower triangle, row by row.
-    below = np.full((model.nv, model.nv), -1)
+    lower = np.full((model.nv, model.nv), -1)
     for row, (first, count) in enumerate(zip(model.M_rowadr, model.M_rownnz, strict=True)):
         entries = np.arange(first, first + count)
-        below[row, model.M_colind[entries]] = inertia + entries
-    whole = np.maximum(below, below.T)[np.ix_(cell.dof, cell.dof)]
+        lower[row, model.M_colind[entries]] = inertia + entries
+    symmetric = np.maximum(lower, lower.T)[np.ix_(cell.dof, cell.dof)]
     return (
-        np.vstack((qpos + cell.qpos, qvel + cell.dof, bias + cell.dof, passive + cell.dof, whole)),
+        np.vstack(
+            (qpos + cell.qpos, qvel + cell.dof, bias + cell.dof, passive + cell.dof, symmetric)
+        ),
         memory,
     )
 
@@ -164,13 +166,13 @@ def evaluate(
             evaluation. Both are equal afterwards.
     """
     newest = evaluations[0]
-    given = evaluations[1]
+    current = evaluations[1]
     joints = places.shape[1]
     same = True
     for row in range(STATE_ROWS):
         for joint in range(joints):
-            same &= newest[row, joint] == given[row, joint]
-            newest[row, joint] = memory[places[row, joint]] = given[row, joint]
+            same &= newest[row, joint] == current[row, joint]
+            newest[row, joint] = memory[places[row, joint]] = current[row, joint]
     if not same:
         # These six are all steps of `mj_fwdPosition` that inertia and bias need.
         mj_kinematics(model, data)
@@ -185,7 +187,7 @@ def evaluate(
             for other in range(joints):
                 place = places[4 + joint, other]
                 newest[INERTIA_ROW + joint, other] = memory[place] if place >= 0 else 0.0
-    given[BIAS_ROW:] = newest[BIAS_ROW:]
+    current[BIAS_ROW:] = newest[BIAS_ROW:]
 
 
 @compiled_for("f8, f8[::1], i8, i8, i8[::1], i8, f8[::1], f8[::1], f8[::1], f8[:,:,::1], f8[:,::1]")

@@ -106,11 +106,11 @@ def one_view(*arrays: Array) -> tuple[Array, NDArray[np.int64]]:
     """
     begins = np.array([array.ctypes.data for array in arrays])
     ends = [int(begin) + array.nbytes for begin, array in zip(begins, arrays, strict=True)]
-    first = int(begins.min())
+    start = int(begins.min())
     item = np.dtype(np.float64).itemsize
     return (
-        _view(first, np.float64, ((max(ends) - first) // item,), (item,)),
-        (begins - first) // item,
+        _view(start, np.float64, ((max(ends) - start) // item,), (item,)),
+        (begins - start) // item,
     )
 
 

@@ -104,7 +104,12 @@ def _check_fingers(robot: RobotConfig, hand: HandConfig) -> None:
                     f" {have}"
                 )
     for joint in robot.joints:
-        owners = [finger.name for finger in hand.finger for own in finger.joints if own == joint]
+        owners = [
+            finger.name
+            for finger in hand.finger
+            for finger_joint in finger.joints
+            if finger_joint == joint
+        ]
         if len(owners) != 1:
             named = ", ".join(f"'{name}'" for name in owners) or "none"
             raise RobotError(

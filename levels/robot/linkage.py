@@ -94,10 +94,10 @@ def solve_linkage(
     openings = np.linspace(
         min(config.open, config.closed), max(config.open, config.closed), OPENINGS
     )
-    rest = float(model.qpos0[solver.driven])
-    first = int(np.argmin(np.abs(openings - rest)))
+    reference = float(model.qpos0[solver.driven])
+    first = int(np.argmin(np.abs(openings - reference)))
     positions = np.zeros((len(solver.joints), OPENINGS))
-    for opening in np.linspace(rest, openings[first], APPROACH_STEPS):
+    for opening in np.linspace(reference, openings[first], APPROACH_STEPS):
         middle = solver.settle(model.qpos0, float(opening))
     for steps in (range(first, OPENINGS), range(first, -1, -1)):
         qpos = middle
@@ -175,15 +175,15 @@ class _Solver:
         step = np.zeros(count)
         for _ in range(ITERATIONS if count else 0):
             residual, jacobian, stiffness = self._rows()
-            most = self._stiffest
+            stiffest = self._stiffest
             if yielding:
-                most = float(np.max(stiffness, initial=1e-12))
-                parts = np.sqrt(stiffness / most)
+                stiffest = float(np.max(stiffness, initial=1e-12))
+                parts = np.sqrt(stiffness / stiffest)
                 residual *= parts
                 jacobian *= parts[:, None]
-            springs = self._stiffness / most
+            springs = self._stiffness / stiffest
             if self._tendons.size:
-                stretched, pulls = self._stretched(most)
+                stretched, pulls = self._stretched(stiffest)
                 residual = np.concatenate((residual, stretched))
                 jacobian = np.concatenate((jacobian, pulls))
             mujoco.mju_mulMatTMat(matrix, jacobian, jacobian)
@@ -214,13 +214,13 @@ class _Solver:
         Raises:
             RobotError: A loop stays open.
         """
-        away, equality = self.farthest()
-        self.yields |= away > RESIDUAL
-        if away > self._config.residual and self._model.eq_type[equality] in map(int, LOOPS):
+        residual, equality = self.farthest()
+        self.yields |= residual > RESIDUAL
+        if residual > self._config.residual and self._model.eq_type[equality] in map(int, LOOPS):
             raise RobotError(
-                f"robot.gripper: equality {equality_name(self._model, equality)} is {away:.4f} m"
-                f" or rad off with the gripper at {opening:g}; robot.gripper.residual permits"
-                f" {self._config.residual:g}"
+                f"robot.gripper: equality {equality_name(self._model, equality)} is off by"
+                f" {residual:.4f} m or rad with the gripper at {opening:g}; robot.gripper.residual"
+                f" permits {self._config.residual:g}"
             )
 
     def check_all_follow(self) -> None:

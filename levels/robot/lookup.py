@@ -77,7 +77,7 @@ def unknown_names(robot: RobotConfig, scene: SceneConfig) -> Iterator[str]:
     kind = mujoco.mjtObj
     is_body = mujoco.mj_name2id(model, kind.mjOBJ_BODY, robot.tool) >= 0
     gripper = robot.gripper
-    wanted = [
+    expected = [
         (kind.mjOBJ_JOINT, robot.joints, "robot.joints"),
         (kind.mjOBJ_SITE, () if is_body else (robot.tool,), "robot.tool"),
         (kind.mjOBJ_BODY, tuple(chain(*robot.exclude)), "robot.exclude"),
@@ -85,20 +85,20 @@ def unknown_names(robot: RobotConfig, scene: SceneConfig) -> Iterator[str]:
     ]
     if robot.hand is not None:
         tips = tuple(finger.tip for finger in robot.hand.finger)
-        wanted += [
+        expected += [
             (kind.mjOBJ_SITE, tips, "robot.hand.finger.tip"),
             (kind.mjOBJ_ACTUATOR, robot.hand.flexors, "robot.hand.flexors"),
             (kind.mjOBJ_ACTUATOR, robot.hand.extensors, "robot.hand.extensors"),
         ]
-    wanted += [
+    expected += [
         (kind.mjOBJ_BODY, scene.objects, "scene.objects"),
         (kind.mjOBJ_BODY, scene.obstacles, "scene.obstacles"),
         (kind.mjOBJ_GEOM, scene.supports, "scene.supports"),
     ]
-    for what, names, place in wanted:
+    for element_kind, names, place in expected:
         for name in names:
             try:
-                find(model, what, name, place)
+                find(model, element_kind, name, place)
             except RobotError as error:
                 yield str(error)
 
@@ -189,8 +189,8 @@ def derived(robot: RobotConfig) -> RobotConfig:
     carried = below(model, np.array([last]))
     sites = [model.site(k).name for k in np.flatnonzero(carried[model.site_bodyid])]
     named = [name for name in sites if name] or [model.body(last).name]
-    found = {"joints": joints, "tool": robot.tool or named[-1], "home": robot.home or tuple(home)}
-    return robot.model_copy(update=found)
+    values = {"joints": joints, "tool": robot.tool or named[-1], "home": robot.home or tuple(home)}
+    return robot.model_copy(update=values)
 
 
 def _driven(model: mujoco.MjModel, robot: RobotConfig) -> tuple[str, ...]:
@@ -199,7 +199,7 @@ def _driven(model: mujoco.MjModel, robot: RobotConfig) -> tuple[str, ...]:
     driven = np.unique(model.actuator_trnid[of_joint, 0])
     names = [str(model.joint(k).name) for k in driven]
     gripper = robot.gripper
-    own = (
+    gripper_joints = (
         () if gripper is None else (gripper.joint, *(follower.joint for follower in gripper.follow))
     )
-    return tuple(name for name in names if name not in own)
+    return tuple(name for name in names if name not in gripper_joints)

@@ -77,17 +77,17 @@ def drop_fixed_inertias(body: mujoco.MjsBody) -> bool:
     Returns:
         True if any was removed.
     """
-    found = False
+    is_dropped = False
     # The lists of children of a body raise the error of the failed compilation again.
     child = body.first_body()
     while child is not None:
         if child.first_joint() is None:
-            found |= drop_fixed_inertias(child) or bool(child.explicitinertial)
+            is_dropped |= drop_fixed_inertias(child) or bool(child.explicitinertial)
             child.explicitinertial = False
             child.fullinertia = np.full(6, np.nan)
             child.inertia = np.zeros(3)
         child = body.next_body(child)
-    return found
+    return is_dropped
 
 
 def check_number(joints: Sequence[str]) -> None:
@@ -245,12 +245,12 @@ def couple(spec: mujoco.MjSpec, gripper: GripperConfig, follower: FollowConfig) 
             raise RobotError(f"robot.gripper: no joint '{name}' in the model; it has: {have}")
     if follower.joint == gripper.joint:
         raise RobotError(f"robot.gripper.follow: '{follower.joint}' is the driven joint itself")
-    own = [a for a in spec.actuators if a.trntype in JOINT_DRIVES and a.target == follower.joint]
-    if any(a.name == gripper.actuator for a in own):
+    drives = [a for a in spec.actuators if a.trntype in JOINT_DRIVES and a.target == follower.joint]
+    if any(a.name == gripper.actuator for a in drives):
         raise RobotError(
             f"robot.gripper.follow: '{follower.joint}' is driven by the gripper's actuator"
         )
-    remove(spec, own)
+    remove(spec, drives)
     equality = spec.add_equality(name=f"{follower.joint} follows {gripper.joint}")
     equality.type = mujoco.mjtEq.mjEQ_JOINT
     equality.name1 = follower.joint
@@ -289,10 +289,10 @@ def stated_torque(spec: mujoco.MjSpec, joint: str, drives: Iterable[mujoco.MjsAc
         joint: Name of the joint.
         drives: Actuators of the arm.
     """
-    own = spec.joint(joint)
-    found = [reach(own.actfrclimited, own.actfrcrange)]
-    found += [drive_limit(a) for a in drives if a.trntype in JOINT_DRIVES and a.target == joint]
-    return min((x for x in found if 0 < x < MOST), default=0.0)
+    element = spec.joint(joint)
+    limits = [reach(element.actfrclimited, element.actfrcrange)]
+    limits += [drive_limit(a) for a in drives if a.trntype in JOINT_DRIVES and a.target == joint]
+    return min((x for x in limits if 0 < x < MOST), default=0.0)
 
 
 def drive_limit(actuator: mujoco.MjsActuator) -> float:

@@ -139,16 +139,16 @@ class ModelReader:
         """
         name = element.get("file", "")
         places = (folder / name, path.resolve().parent / name)
-        found = find_file(places) or places[0]
-        own = f"{len(self._files)}.xml"
+        target = find_file(places) or places[0]
+        text_name = f"{len(self._files)}.xml"
         if element.tag == "model":
-            self._models[element.get("name")] = own
-            folder = found.resolve().parent
-        elif not found.resolve().is_relative_to(folder):
+            self._models[element.get("name")] = text_name
+            folder = target.resolve().parent
+        elif not target.resolve().is_relative_to(folder):
             raise RobotError(f"model '{path}': include '{name}' leaves the model's folder")
-        self._read(found, folder)
+        self._read(target, folder)
         # MuJoCo finds texts by the last part of their path.
-        element.set("file", str(Path(name).with_name(own)))
+        element.set("file", str(Path(name).with_name(text_name)))
 
     def _check(self, element: ElementTree.Element, place: _Place) -> None:
         """Check an element and everything in it or to which it refers, and count replicas."""
@@ -169,8 +169,8 @@ class ModelReader:
         for child in element:
             self._check(child, _Place(file, owner, copies, depth + 1))
         refers = {"include": element.get("file"), "attach": self._models.get(element.get("model"))}
-        if own := refers.get(tag):
-            inner, root = self._files[own.rpartition("/")[2]]
+        if text_name := refers.get(tag):
+            inner, root = self._files[text_name.rpartition("/")[2]]
             self._check(root, _Place(inner, owner, copies, depth + 1))
 
     def _check_assets(self, model: Path) -> None:
@@ -178,8 +178,12 @@ class ModelReader:
         for folder, name in self._assets:
             places = [folder / place for place in sorted(self._folders)]
             # MuJoCo also strips Windows paths.
-            own = PureWindowsPath(name)
-            files = [place / part for place in places for part in (own.as_posix(), own.name)]
+            asset = PureWindowsPath(name)
+            files = [
+                place / file_name
+                for place in places
+                for file_name in (asset.as_posix(), asset.name)
+            ]
             if find_file(files) is None:
                 looked = ", ".join(map(str, places))
                 raise RobotError(f"model '{model}': no file '{name}'; looked for in {looked}")
@@ -267,14 +271,14 @@ def _mistakes(element: ElementTree.Element, owner: str, is_urdf: bool) -> Iterat
     place = owner if "name" in element.attrib else f"<{element.tag}>" + f" of {owner}" * bool(owner)
     is_part = owner.startswith(("link", "joint"))
     for key, value in element.items():
-        found = numbers(value)
+        values = numbers(value)
         is_wrong = key != "name" and not all(
-            math.isfinite(x) or (math.isinf(x) and key.endswith(LIMITS)) for x in found
+            math.isfinite(x) or (math.isinf(x) and key.endswith(LIMITS)) for x in values
         )
         valid = "finite numbers"
         if is_urdf:
-            is_wrong |= not len(value.split()) == len(found) == (3 if key in VECTORS else 1)
-            is_wrong |= key == "velocity" and not 0.0 <= min(found, default=0.0) < FASTEST
+            is_wrong |= not len(value.split()) == len(values) == (3 if key in VECTORS else 1)
+            is_wrong |= key == "velocity" and not 0.0 <= min(values, default=0.0) < FASTEST
             is_wrong &= is_part and key in NUMBERS
             valid = "3 finite numbers" if key in VECTORS else "a finite number, such as 2.5"
             valid += f", from 0 to {FASTEST:g}" * (key == "velocity")
@@ -289,8 +293,8 @@ def _mistakes(element: ElementTree.Element, owner: str, is_urdf: bool) -> Iterat
 
 def numbers(text: str) -> list[float]:
     """Return the words of an attribute that are numbers. In C syntax, nan(7) is a number."""
-    found = []
+    values = []
     for word in text.split():
         with suppress(ValueError):
-            found.append(float(word.partition("(")[0]))
-    return found
+            values.append(float(word.partition("(")[0]))
+    return values

@@ -60,10 +60,10 @@ def find_wrist(model: mujoco.MjModel, config: WristConfig | None, moved: Mask) -
         raise RobotError(
             f"robot.wrist: site '{model.site(force).name}' is on a body that the arm does not move"
         )
-    most = (config.most_force, config.most_torque)
+    contact_limits = (config.most_force, config.most_torque)
     reaches = model.sensor_cutoff[sensors].tolist()
     for (key, (_, unit)), name, reach, limit in zip(
-        KINDS.items(), names, reaches, most, strict=True
+        KINDS.items(), names, reaches, contact_limits, strict=True
     ):
         if not reach > 0.0:
             raise RobotError(
@@ -74,12 +74,12 @@ def find_wrist(model: mujoco.MjModel, config: WristConfig | None, moved: Mask) -
                 f"robot.wrist.most_{key}: {limit:g} {unit} is beyond the sensor's range; it"
                 f" must be at most {reach:g}"
             )
-    first = model.sensor_adr[sensors]
+    addresses = model.sensor_adr[sensors]
     return Wrist(
         site=force,
-        addresses=(first[:, None] + np.arange(3)).ravel().astype(int),
+        addresses=(addresses[:, None] + np.arange(3)).ravel().astype(int),
         range=(reaches[0], reaches[1]),
-        most=most,
+        most=contact_limits,
         noise=(config.noise, 0.1 * config.noise),
     )
 
@@ -90,14 +90,14 @@ def _sensor(model: mujoco.MjModel, key: str, name: str) -> int:
     Raises:
         RobotError: The model has no such sensor.
     """
-    found = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, name)
+    number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, name)
     is_kind = model.sensor_type == KINDS[key][0]
-    if found >= 0 and is_kind[found]:
-        return int(found)
+    if number >= 0 and is_kind[number]:
+        return int(number)
     have = listed([model.sensor(int(k)).name for k in np.flatnonzero(is_kind)])
     why = (
         f"sensor '{name}' is not a {key} sensor"
-        if found >= 0
+        if number >= 0
         else f"no sensor '{name}' in the model"
     )
     raise RobotError(f"robot.wrist.{key}: {why}; it has these {key} sensors: {have}")

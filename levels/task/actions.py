@@ -101,8 +101,8 @@ def goto(rehearsal: Rehearsal, k: int, action: Goto) -> Rehearsal:
     rehearsal.situation.lay_out(motion.checker, None)
     if action.direction == "any":
         place = pose(action.position, pointing(DOWN))
-        anyhow = motion.ik.reachable(place, rehearsal.q, turned=False)
-        tools = [motion.ik.tool_at(q) for q in anyhow] or [place]
+        reachable = motion.ik.reachable(place, rehearsal.q, turned=False)
+        tools = [motion.ik.tool_at(q) for q in reachable] or [place]
     elif action.quaternion is not None:
         tools = [pose(action.position, action.quaternion)]
     else:

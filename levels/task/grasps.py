@@ -113,7 +113,7 @@ def goals(action: Transfer, at: Pose, cell: Cell) -> Iterator[list[Pose]]:
         yield [_turned(action, at, action.yaw - yaw)]
         return
     turns = [quarter * np.pi / 2.0 for quarter in QUARTERS]
-    between = [turn + part * np.pi / 8.0 for part in (2, 1, 3) for turn in turns]
+    between = [turn + eighths * np.pi / 8.0 for eighths in (2, 1, 3) for turn in turns]
     if len(cell.qpos) < FULL_ORIENTATION:
         turns.append(bearing(cell, np.array(action.to)) - bearing(cell, at.position))
     for group in (turns, between):
@@ -153,8 +153,8 @@ def standing(cell: Cell, data: mujoco.MjData, row: int, situation: Situation) ->
             f"at [{x:.3f}, {y:.3f}] '{name}' would be {place}; supports: {supports}",
         )
     gap = min(
-        mujoco.mj_geomDistance(model, data, int(part), support, MAX_DISTANCE_M, None)
-        for part in cell.parts(row)
+        mujoco.mj_geomDistance(model, data, int(geom), support, MAX_DISTANCE_M, None)
+        for geom in cell.parts(row)
     )
     if abs(gap) > MAX_STANDING_GAP_M:
         side = "above" if gap > 0 else "deep in"
