@@ -302,7 +302,7 @@ class FingerConfig(Table):
     tip: str
     """MJCF site at its tip"""
     joints: tuple[str, ...] = Field(min_length=1)
-    """its joints, base to tip; of robot.joints"""
+    """joints of the finger, a part of robot.joints, base to tip"""
 
 
 class HandConfig(Table):
@@ -355,7 +355,7 @@ class RobotConfig(Table):
     """joint positions to which tasks return, and the simulated start, rad; default: the
     first keyframe"""
     start: tuple[Finite, ...] | None = None
-    """where the simulated arm starts, rad; default: home"""
+    """start position of the simulated arm, rad; default: home"""
     velocity: tuple[Positive, ...]
     """velocity limits, rad/s"""
     acceleration: tuple[Positive, ...]
@@ -441,7 +441,7 @@ class MotionConfig(Table):
     at: Moment
     """simulated time when it starts, s"""
     to: Vector
-    """where its origin goes, m"""
+    """final position of its origin, m"""
     speed: Positive = 0.25
     """speed along the straight line, m/s"""
 
@@ -468,9 +468,9 @@ class GoalConfig(Table):
     """
 
     object: str
-    """object that the task moves, or keeps"""
+    """object that the task moves, or leaves in place"""
     position: Vector
-    """where its origin ends, m"""
+    """final position of its origin, m"""
     # A gripper centres a part across its pads, but not along them. In that direction the part keeps
     # its offset, or slips.
     tolerance_mm: Positive = 10.0

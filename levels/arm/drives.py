@@ -333,7 +333,7 @@ class SetPointGate:
         at_rest = np.zeros(len(distance))
         max_speed = speed_towards(distance, at_rest, self._fastest, self._braking, period_s)
         closing = np.copysign(np.minimum(distance / period_s, max_speed), missing)
-        # Within this distance `most` does not limit `closing`.
+        # Within this distance `max_speed` does not limit `closing`.
         cut = (distance > self._braking * period_s**2).any()
         return target.velocity + closing, bool(cut)
 

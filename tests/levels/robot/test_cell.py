@@ -68,7 +68,7 @@ def test_a_free_body_listed_before_the_arm_shifts_no_index(tmp_path: Path) -> No
         ('<general jointinparent="shoulder" gainprm="10" ctrlrange="-3 3"/>', 30.0),
     ],
 )
-def test_whatever_drives_a_joint_becomes_a_torque_motor_with_its_limit(
+def test_any_drive_of_a_joint_becomes_a_torque_motor_with_its_limit(
     tmp_path: Path, shoulder: str, limit: float
 ) -> None:
     made = build(pendulum(tmp_path, shoulder + '<motor joint="elbow" ctrlrange="-20 20"/>'))
@@ -81,7 +81,7 @@ def test_whatever_drives_a_joint_becomes_a_torque_motor_with_its_limit(
     assert data.qfrc_actuator[made.dof] == pytest.approx([1.5, -2.5])
 
 
-def test_sensors_and_keyframes_of_replaced_actuators_go_with_them(tmp_path: Path) -> None:
+def test_sensors_and_keyframes_of_replaced_actuators_are_removed(tmp_path: Path) -> None:
     robot = pendulum(tmp_path, MOTORS.replace("<motor", '<motor name="m"', 1))
     text = robot.model.read_text()
     extra = (

@@ -28,7 +28,7 @@ def build(robot: RobotConfig) -> Cell:
     return build_cell(robot, config("utah_mit")[1], CLOCK_NS)
 
 
-def changed(folder: Path, old: str, new: str) -> RobotConfig:
+def replace_in_model(folder: Path, old: str, new: str) -> RobotConfig:
     """Return the hand with `old` in its model replaced."""
     text = (ROBOTS / "utah_mit.xml").read_text()
     assert text.count(old) == 1, old
@@ -36,7 +36,7 @@ def changed(folder: Path, old: str, new: str) -> RobotConfig:
     return config("utah_mit")[0].model_copy(update={"model": folder / "hand.xml"})
 
 
-def retold(**hand: Any) -> RobotConfig:
+def replace_in_table(**hand: Any) -> RobotConfig:
     """Return the hand with keys of `[robot.hand]` replaced."""
     robot = config("utah_mit")[0]
     assert robot.hand is not None
@@ -100,11 +100,11 @@ def test_the_palm_belongs_to_the_hand_and_may_touch_what_it_holds() -> None:
         (TENDON, TENDON.replace("</fixed>", '<joint joint="index1" coef=".01"/></fixed>'), "tendon of joint 'index0' also turns joint 'index1'"),
     ],
 )  # fmt: skip
-def test_a_tendon_that_is_no_half_of_a_pair_is_refused(
+def test_a_tendon_that_is_not_part_of_a_pair_is_refused(
     tmp_path: Path, old: str, new: str, why: str
 ) -> None:
     with pytest.raises(RobotError, match=r"robot\.hand") as refused:
-        build(changed(tmp_path, old, new))
+        build(replace_in_model(tmp_path, old, new))
     assert why in str(refused.value)
     assert "\n" not in str(refused.value)
 
@@ -122,10 +122,10 @@ def test_a_tendon_that_is_no_half_of_a_pair_is_refused(
 )
 def test_tensions_and_lists_that_do_not_fit_are_refused(what: dict[str, Any], why: str) -> None:
     with pytest.raises(RobotError, match=why):
-        build(retold(**what))
+        build(replace_in_table(**what))
 
 
-def test_a_hand_has_neither_gripper_nor_torque_limits_of_its_own() -> None:
+def test_a_hand_has_no_gripper_and_no_torque_limits() -> None:
     robot = config("utah_mit")[0]
     with pytest.raises(
         RobotError, match=r"robot\.torque: torques of a hand follow from its tendons"

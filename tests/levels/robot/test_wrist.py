@@ -15,14 +15,14 @@ from tests.levels.systems.force.pad import pad
 CLOCK_NS = 1_000_000
 
 
-def test_range_limits_and_noise_are_those_of_model_and_config(tmp_path: Path) -> None:
+def test_range_limits_and_noise_come_from_model_and_config(tmp_path: Path) -> None:
     wrist = build_cell(*pad(tmp_path, noise=0.3), CLOCK_NS).wrist
     assert wrist is not None
     assert (wrist.range, wrist.most, wrist.noise) == ((150.0, 20.0), (60.0, 8.0), (0.3, 0.03))
     assert np.array_equal(wrist.addresses, np.arange(6))
 
 
-def test_what_hangs_on_the_sensor_may_touch_supports_and_nothing_else(tmp_path: Path) -> None:
+def test_bodies_beyond_the_sensor_may_touch_supports_only(tmp_path: Path) -> None:
     model = (cell := build_cell(*pad(tmp_path), CLOCK_NS)).model
     tip, flange, table, floor = (
         model.geom(name).id for name in ("pad", "flange", "table", "pedestal")

@@ -16,11 +16,11 @@ PUMA, SCENE = config("puma560")
 NASREM = load("nasrem")
 
 
-def read(*actions: dict[str, Any]) -> TaskConfig:
+def read_actions(*actions: dict[str, Any]) -> TaskConfig:
     return read_program({"action": list(actions)}, PUMA, SCENE)
 
 
-def mistake(*actions: dict[str, Any]) -> str:
+def find_mistakes(*actions: dict[str, Any]) -> str:
     """Return all mistakes of a program, as the check of a config reports them."""
     with pytest.raises(ConfigError) as caught:
         resolve(NASREM.model_copy(update={"task": {"action": list(actions)}}))
@@ -28,7 +28,7 @@ def mistake(*actions: dict[str, Any]) -> str:
 
 
 def test_actions_of_every_kind_are_read() -> None:
-    transfer, pose, joints, home = read(
+    transfer, pose, joints, home = read_actions(
         {"do": "transfer", "object": "peg", "to": [0.5, 0.3, 0.5], "yaw": 1.0, "by": 30},
         {"do": "goto", "position": [0.5, 0.2, 0.7], "direction": [0, 0, -1]},
         {"do": "goto", "joints": [0, 0, 0, 0, 0, 0]},
@@ -83,10 +83,10 @@ def test_actions_of_every_kind_are_read() -> None:
 def test_each_mistake_is_one_line_with_place_value_and_what_is_valid(
     action: dict[str, Any], line: str
 ) -> None:
-    assert mistake(action) == line
+    assert find_mistakes(action) == line
 
 
-def test_transfer_needs_a_gripper() -> None:
+def test_a_transfer_needs_a_gripper() -> None:
     robot, scene = config("k1607")
     with pytest.raises(ProgramError, match="the robot has no gripper; valid actions: goto, home"):
         read_program(
