@@ -192,11 +192,12 @@ class Program(Table):
         try:
             program = cls.model_validate(table)
         except ValidationError as error:
-            lines = [
-                f"task.{'.'.join(map(str, entry['loc']))}: {entry['msg']}"
-                for entry in error.errors()
-            ]
-            raise ProgramError("\n".join(lines)) from error
+            raise ProgramError(
+                "\n".join(
+                    f"task.{'.'.join(map(str, entry['loc']))}: {entry['msg']}"
+                    for entry in error.errors()
+                )
+            ) from error
         if misfits := [
             f"task.{key} = {value!r}: {why}" for key, value, why in program.misfits(robot, scene)
         ]:

@@ -13,7 +13,7 @@ from rack.levels.arm.braked_arm import BrakedArm
 from rack.levels.arm.drivable import JointTarget
 from rack.levels.compiled import compiled, compiled_for
 from rack.levels.level import Finding
-from rack.levels.robot.dynamics import BIAS_ROW, FRICTION_SPEED, INERTIA_ROW, Dynamics
+from rack.levels.robot.dynamics import FRICTION_SPEED, INERTIA_ROW, Dynamics
 from rack.levels.robot.limits import Bounds, Limits
 
 SPEED_PART = 0.99
@@ -145,9 +145,7 @@ def is_clear(
         limits: (6, joints): torque, speed, low and high end of the range, braking, dry friction.
         period_s: Time for which the torque acts, s.
     """
-    q = evaluation[0]
-    qd = evaluation[1]
-    bias = evaluation[BIAS_ROW]
+    q, qd, bias = evaluation[:INERTIA_ROW]
     inertia = evaluation[INERTIA_ROW:]
     most_torque, fastest, low, high, braking, dry = limits
     net_torque = torque - bias
@@ -159,7 +157,7 @@ def is_clear(
     for joint in range(len(q)):
         speed = fastest[joint]
         deceleration = braking[joint]
-        margin = CLEAR_PART * fastest[joint]
+        margin = CLEAR_PART * speed
         lowest = (
             -speed_towards(q[joint] - low[joint], -qd[joint], speed, deceleration, period_s)
             - qd[joint]

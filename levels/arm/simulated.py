@@ -233,10 +233,10 @@ class SimulatedArm(Simulation, Arm):
         self.clipped += cut
         self._data.qfrc_applied[cell.dof] = passed if braked else 0.0
         np.copyto(self.torque, 0.0 if braked else passed)
-        motor_torque = (
-            self.torque if self._most is None else np.clip(self.torque, -self._most, self._most)
-        )
-        self._data.ctrl[cell.actuators] = motor_torque
+        torque = self.torque
+        if self._most is not None:
+            torque = np.clip(torque, -self._most, self._most)
+        self._data.ctrl[cell.actuators] = torque
         self._given = True
 
     def _braking_torque(self, q: Array, qd: Array) -> Array:

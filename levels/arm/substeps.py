@@ -144,8 +144,7 @@ def advance(  # noqa: PLR0913  # flat arguments: a field of a record takes 0.1 u
     """
     before = states[0]
     after = states[1]
-    low = judged[0]
-    high = judged[1]
+    low, high = judged[:2]
     seen = judged[2:]
     if begin == 0:
         copy_state(model, data, asleep, before)

@@ -172,9 +172,7 @@ def set_point(
     piece = len(marks) - 1
     while piece > 0 and s < marks[piece, 0]:
         piece -= 1
-    waypoint = table[piece, 0]
-    direction = table[piece, 1]
-    change = table[piece, 2]
+    waypoint, direction, change = table[piece]
     b = marks[piece, 2]
     sigma = s - marks[piece, 1]
     for j in range(len(waypoint)):

@@ -360,17 +360,14 @@ def _keeps(stop: Trajectory, path: BlendedPath, limits: Limits) -> bool:
 
     The check uses bounds of motion and path over each interval of time.
     """
-    switches = stop.sections[:, 0]
     times = _checked_times(stop)
     s, ds, dds = stop.states(times)
-    jerk = np.abs(stop.sections[np.searchsorted(switches, times[:-1], side="right") - 1, 4])
+    section = np.searchsorted(stop.sections[:, 0], times[:-1], side="right") - 1
+    jerk = np.abs(stop.sections[section, 4])[:, None]
     # In an interval dds is linear and keeps its sign, so values at the ends bound dds and ds.
-    acceleration = np.maximum(np.abs(dds[:-1]), np.abs(dds[1:]))
-    speed = np.maximum(ds[:-1], ds[1:])
+    acceleration = np.maximum(np.abs(dds[:-1]), np.abs(dds[1:]))[:, None]
+    speed = np.maximum(ds[:-1], ds[1:])[:, None]
     first, second, third = _bounds_over(path, s)
-    speed = speed[:, None]
-    acceleration = acceleration[:, None]
-    jerk = jerk[:, None]
     # The result of ** 3 on an array differs between processors.
     cubed = speed * speed * speed
     tolerance = 1.0 + LIMIT_ROUNDING

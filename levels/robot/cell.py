@@ -328,12 +328,12 @@ def find_gripper(
         return None, np.zeros(model.nbody, dtype=bool)
     name = config.joint
     joint = lookup.find(model, mujoco.mjtObj.mjOBJ_JOINT, name, "robot.gripper.joint")
-    if name in robot.joints or not moved[model.jnt_bodyid[joint]]:
+    body = model.jnt_bodyid[joint]
+    if name in robot.joints or not moved[body]:
         raise RobotError(
             f"robot.gripper.joint: '{name}' must be a joint that the arm carries, and not be in"
             " robot.joints"
         )
-    body = model.jnt_bodyid[joint]
     while (
         (parent := model.body_parentid[body])
         and model.body_jntnum[parent]
@@ -392,10 +392,10 @@ def ease_gripper(cell: Cell, spec: mujoco.MjSpec, config: GripperConfig, tick_s:
         mujoco.mj_fwdPosition(model, data)
         contact = data.contact
         overlap = np.isin(contact.geom, cell.geoms.gripper).all(axis=1) & (contact.dist < 0.0)
-        bodies = model.geom_bodyid[contact.geom[overlap]]
-        overlaps |= {tuple(sorted(pair)) for pair in bodies.tolist()}
+        bodies = model.geom_bodyid[contact.geom[overlap]].tolist()
+        overlaps |= set(map(tuple, map(sorted, bodies)))
     names = [[model.body(body).name for body in pair] for pair in sorted(overlaps)]
-    named = [pair for pair in names if all(pair)]
+    named = [*filter(all, names)]
     for first, second in named:
         spec.add_exclude(bodyname1=first, bodyname2=second)
     missing = config.gains[1] * tick_s - float(model.dof_M0[gripper.dof])  # kg or kg m2

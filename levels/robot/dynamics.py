@@ -165,8 +165,7 @@ def evaluate(
         evaluations: (2, 3 + joints, joints). The second holds the state; the first is the last
             evaluation. Both are equal afterwards.
     """
-    newest = evaluations[0]
-    current = evaluations[1]
+    newest, current = evaluations
     joints = places.shape[1]
     same = True
     for row in range(STATE_ROWS):

@@ -132,16 +132,14 @@ class _Solver:
         carried[arm] = carried[joint] = False
         check_commanded(model, config, carried)
         self._others = np.flatnonzero(carried & ~np.isin(model.jnt_type, SCALAR_JOINTS))
-        follow = np.flatnonzero(carried & np.isin(model.jnt_type, SCALAR_JOINTS))
-        self._follow = follow
+        self._follow = follow = np.flatnonzero(carried & np.isin(model.jnt_type, SCALAR_JOINTS))
         self._loose = np.ones(len(follow), dtype=bool)
         self.yields = False
         self.driven = int(model.jnt_qposadr[joint])
         self.joints = model.jnt_qposadr[follow].astype(int)
         self._dof = model.jnt_dofadr[follow]
         self._driven_dof = int(model.jnt_dofadr[joint])
-        stiffness = model.jnt_stiffness[follow]
-        self._stiffness = stiffness
+        self._stiffness = stiffness = model.jnt_stiffness[follow]
         self._tendons = np.flatnonzero(model.tendon_stiffness > 0.0)
         # Relative to an equality, the stiffest spring has the weight `SPRING_PART`.
         springs = (*stiffness, *model.tendon_stiffness)

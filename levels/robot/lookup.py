@@ -181,16 +181,20 @@ def derived(robot: RobotConfig) -> RobotConfig:
     if not joints:
         raise RobotError("robot.joints: name the joints, because none in the model has an actuator")
     check_number(joints)
-    kind = mujoco.mjtObj.mjOBJ_JOINT
-    ids = [find(model, kind, name, "robot.joints") for name in joints]
+    ids = find_all(model, mujoco.mjtObj.mjOBJ_JOINT, joints, "robot.joints")
     start = model.key_qpos[0] if model.nkey else model.qpos0
     home = start[model.jnt_qposadr[ids]].tolist()
     last = int(model.jnt_bodyid[ids[-1]])
     carried = below(model, np.array([last]))
     sites = [model.site(k).name for k in np.flatnonzero(carried[model.site_bodyid])]
     named = [name for name in sites if name] or [model.body(last).name]
-    values = {"joints": joints, "tool": robot.tool or named[-1], "home": robot.home or tuple(home)}
-    return robot.model_copy(update=values)
+    return robot.model_copy(
+        update={
+            "joints": joints,
+            "tool": robot.tool or named[-1],
+            "home": robot.home or tuple(home),
+        }
+    )
 
 
 def _driven(model: mujoco.MjModel, robot: RobotConfig) -> tuple[str, ...]:

@@ -299,11 +299,11 @@ def drive_limit(actuator: mujoco.MjsActuator) -> float:
     """Return the torque limit that an actuator on a joint implies, N m. 0 if it has none."""
     gear = abs(float(actuator.gear[0]))
     limits = [reach(actuator.forcelimited, actuator.forcerange) * gear]
-    direct = (
+    if (
         actuator.dyntype == mujoco.mjtDyn.mjDYN_NONE
         and actuator.biastype == mujoco.mjtBias.mjBIAS_NONE
-    )
-    if direct and actuator.gaintype == mujoco.mjtGain.mjGAIN_FIXED:
+        and actuator.gaintype == mujoco.mjtGain.mjGAIN_FIXED
+    ):
         limits.append(
             reach(actuator.ctrllimited, actuator.ctrlrange) * abs(float(actuator.gainprm[0])) * gear
         )

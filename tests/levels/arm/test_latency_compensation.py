@@ -18,7 +18,7 @@ from rack.levels.arm.latency_compensation import PresentLink
 from rack.levels.messages import Error
 from rack.levels.robot.cell import Cell, build_cell
 from rack.levels.tables import RobotConfig, SceneConfig
-from tests.levels.arm.test_guard import TICK_S, driven, excess, random_torques
+from tests.levels.arm.test_guard import TICK_S, compute_excess, drive_cycles, random_torques
 from tests.levels.arm.test_own_arm import GOAL, START, IdealArm
 from tests.levels.arms import pendulum
 from tests.levels.lockstep import CLOCK_NS
@@ -150,6 +150,6 @@ def test_late_samples_do_not_lead_beyond_a_limit(tmp_path: Path, arm: type[LateA
     arm.late = 4
     own = arm(cell, SceneConfig(), CLOCK_NS)
     guard = GuardedArm(own, TICK_S, PresentLink(own, TICK_S))
-    assert max(excess(cell, driven(guard, own, random_torques(cell, 0, 800)))) <= 0.0
+    assert max(compute_excess(cell, drive_cycles(guard, own, random_torques(cell, 0, 800)))) <= 0.0
     assert own.clipped > 50
     assert own.violations == 0
