@@ -29,13 +29,13 @@ Ports
 - Messages that must not be missed, such as requests for motions, use a `QueuedOutput`. Fill its
   `message` and call `send()` for each message, several times in a cycle if necessary. `send()`
   returns False when the queue is full: try again in a later cycle. The only reader gets each
-  message once and in order, the older unread ones in `Reading.earlier`, at most `room(port)` in a
-  cycle. Messages that a board has taken in the cycle in which it dies are lost. The sender notices
-  this by the ids that the reader's status echoes.
+  message once and in order, the older unread ones in `Reading.earlier`, at most
+  `max_messages(port)` in a cycle. Messages that a board has taken in the cycle in which it dies are
+  lost. The sender notices this by the ids that the reader's status echoes.
 - A mailbox of another rack that `[adapter.lan]` imports is read as `Input(Message, "lan.<port>")`.
   It is lost when its information is older than `max_age_ms`, and immediately when that rack is
   lost. `lan.peer_<rack>`, a `PeerPresence`, shows whether that rack is present.
-- Ports that a config creates (`made_ports`) are in `self.ports`, by name.
+- Ports that a config creates (`build_ports`) are in `self.ports`, by name.
 
 Messages
 - A message is a class: see `rack.backplane.message`. Reader and writer of a mailbox must name the
@@ -50,9 +50,9 @@ Messages
 
 Operator: a level that accepts commands declares `operator = Input(OperatorCommand,
 "own.operator")`, lists the commands in `commands`, and handles them with
-`rack.levels.operator.Orders`. Its status derives from `AnsweringStatus` (`orders.report`) and its
-command from `RelayedCommand` (`command.operator = orders.rests_on(...)`). A level that accepts none
-copies `operator` from the command above to its own command and status. Otherwise the system's
+`rack.levels.operator.Orders`. Its status derives from `AnsweringStatus` (`orders.fill_status`) and
+its command from `RelayedCommand` (`command.operator = orders.find_basis(...)`). A level that accepts
+none copies `operator` from the command above to its own command and status. Otherwise the system's
 response to an operator cannot be measured.
 
 Events: declare what a level can detect, `contact = FindingKind(unit="N m", doc="the arm touches
@@ -499,7 +499,7 @@ class Executor(LevelSection, ABC):
     ) -> Sequence[str]:
         """Return the names that an operator may give with an operation.
 
-        See `rack.levels.operator.NAMED`.
+        See `rack.levels.operator.NAMED_OPERATIONS`.
 
         Args:
             what: The operation.

@@ -59,7 +59,7 @@ class BrakedArm(Plant, DrivableArm):
     def drive(self, torque: Array, grip_force: float) -> Finding | None:
         """Release the brakes and apply torques, N m, and grip force, N; see `Link.drive`.
 
-        Sets `waited` to 0. By default it is not implemented; see `takes`.
+        Sets `waited` to 0. By default it is not implemented; see `has_interface`.
         """
         raise NotImplementedError
 
@@ -67,7 +67,7 @@ class BrakedArm(Plant, DrivableArm):
         """Release the brakes and follow a set point; see `Link.follow`.
 
         Sets `waited` to 0, and `torque` to the predicted or reported torque. By default it is not
-        implemented; see `takes`.
+        implemented; see `has_interface`.
         """
         raise NotImplementedError
 

@@ -70,7 +70,7 @@ class Plant:
     def save(self, state: ArmState) -> None:
         """Fill an `ArmState` with the state that a restarted board needs.
 
-        By default these are the attributes in `SAVED`. A simulation adds its state to
+        By default these are the attributes in `SAVED_ATTRIBUTES`. A simulation adds its state to
         `state.state`, see `rack.levels.robot.engine`.
         """
         self.report_cycle()

@@ -38,7 +38,7 @@ class Simulation(Plant):
     """A plant in MuJoCo, in `substeps` steps per tick. Simulated time is always tick times period.
 
     Subclasses call `prepare_simulation` in their constructor, and give the drives their commands
-    before each `_simulate`.
+    before each `_simulate_tick`.
     """
 
     sleeps: ClassVar[bool] = True

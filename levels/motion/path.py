@@ -96,7 +96,7 @@ class BlendedPath:
         before = at - (radius > 0.0)
         blends = radius[:, None]
         changes = np.where(blends > 0.0, self._changes[at], 0.0)
-        # In the layout of `set_point`.
+        # In the layout of `compute_point`.
         self._marks = np.hstack((self.breaks[:-1, None], self._corners[at, None], blends))
         self._table = np.stack((points[at], directions[before], changes), axis=1)
         self._point = np.zeros((3, self.joints))
@@ -195,8 +195,8 @@ def points_at(marks: Array, table: Array, places: Array) -> Array:
     """Return points of a path, (n, joints), rad.
 
     Args:
-        marks: See `set_point`.
-        table: See `set_point`.
+        marks: See `compute_point`.
+        table: See `compute_point`.
         places: Path parameters, (n,), rad.
     """
     points = np.empty((len(places), table.shape[2]))

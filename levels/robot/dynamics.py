@@ -190,7 +190,7 @@ def evaluate(
 
 
 @compiled_for("f8, f8[::1], i8, i8, i8[::1], i8, f8[::1], f8[::1], f8[::1], f8[:,:,::1], f8[:,::1]")
-def carry(  # noqa: PLR0913  # flat, as `advance` in levels/arm/substeps.py
+def carry(  # noqa: PLR0913  # flat, as `make_steps` in levels/arm/substeps.py
     mass: float,
     offset: Array,
     model: int,

@@ -169,11 +169,11 @@ class MotorPatience(NamedTuple):
 def patience_of(robot: RobotConfig, bounds: Bounds, energy_j: float) -> MotorPatience:
     """Compute the patience of the motors.
 
-    By default, it is the time in which a stop from full speed grows by at most `PATIENCE_PART`. The
-    growth is the angle that joints turn at full speed in this time, relative to the angle in which
-    the brakes stop them. It is also the energy that all motors add at full torque, relative to the
-    energy that the brakes absorb anyway. (The limits hold without this, because the limit gate
-    checks the torque in every tick.)
+    By default, it is the longest time in which a stop from full speed grows by at most
+    `PATIENCE_FRACTION`, by two criteria. The first compares the angle that joints turn at full
+    speed in this time with the angle in which the brakes stop them. The second compares the energy
+    that all motors add at full torque with the energy that the brakes absorb anyway. (The limits
+    hold without this, because the limit gate checks the torque in every tick.)
 
     Args:
         robot: The `[robot]` table.

@@ -141,7 +141,7 @@ class _Solver:
         self._driven_dof = int(model.jnt_dofadr[joint])
         self._stiffness = stiffness = model.jnt_stiffness[follow]
         self._tendons = np.flatnonzero(model.tendon_stiffness > 0.0)
-        # Relative to an equality, the stiffest spring has the weight `SPRING_PART`.
+        # Relative to an equality, the stiffest spring has the weight `SPRING_WEIGHT`.
         springs = (*stiffness, *model.tendon_stiffness)
         self._stiffest = max(float(np.max(springs, initial=0.0)), 1e-12) / SPRING_PART
         self._relaxed = model.qpos_spring[self.joints]
