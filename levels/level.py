@@ -51,9 +51,9 @@ Messages
 Operator: a level that accepts commands declares `operator = Input(OperatorCommand,
 "own.operator")`, lists the commands in `commands`, and handles them with
 `rack.levels.operator.Orders`. Its status derives from `AnsweringStatus` (`orders.fill_status`) and
-its command from `RelayedCommand` (`command.operator = orders.find_basis(...)`). A level that accepts
-none copies `operator` from the command above to its own command and status. Otherwise the system's
-response to an operator cannot be measured.
+its command from `RelayedCommand` (`command.operator = orders.find_basis(...)`). A level that
+accepts none copies `operator` from the command above to its command and status. Otherwise the
+system's response to an operator cannot be measured.
 
 Events: declare what a level can detect, `contact = FindingKind(unit="N m", doc="the arm touches
 something")`, and report it by `self.raise_finding("contact", 3.2, text="left finger")`, in every
