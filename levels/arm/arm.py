@@ -47,28 +47,32 @@ class Arm(BrakedArm):
     _guard: GuardedArm | None = None
 
     def connect(
-        self, tick_s: float, part: float, acted: dict[int, bool], holds: Callable[[], bool]
+        self,
+        tick_s: float,
+        speed_fraction: float,
+        acted: dict[int, bool],
+        holds: Callable[[], bool],
     ) -> ArmLinks:
         """Return the links between servo level and arm; see `DrivableArm.connect`."""
         link = present_link(self, tick_s)
         if not self.keeps_limits:
-            link = self._guard = GuardedArm(self, tick_s, link, part)
+            link = self._guard = GuardedArm(self, tick_s, link, speed_fraction)
         return ArmLinks(link, FaultyLink(self, acted, link, holds))
 
-    def permit(self, part: float) -> None:
+    def permit(self, speed_fraction: float) -> None:
         """Change the fraction of their limits below which the link keeps velocities."""
         if self._guard is not None:
-            self._guard.permit(part)
+            self._guard.permit(speed_fraction)
 
     @classmethod
-    def misfit(cls, cell: Cell, part: float) -> str:
+    def misfit(cls, cell: Cell, speed_fraction: float) -> str:
         """Return why `connect` would fail for a cell. Empty if it would not.
 
         Called before the launch.
         """
         try:
             if not cls.keeps_limits:
-                kept_bounds(cell, part)
+                kept_bounds(cell, speed_fraction)
         except RobotError as error:
             return str(error)
         return ""

@@ -72,8 +72,8 @@ class Link(Protocol):
         A torque that must not be applied (see `BrakedArm.refused`) engages the brakes.
 
         Args:
-            torque: (joints,), N m.
-            grip_force: N.
+            torque: Joint torques, (joints,), N m.
+            grip_force: Force of the gripper, N.
 
         Returns:
             Why the torque was refused. None if it was applied.
@@ -152,13 +152,17 @@ class DrivableArm(ABC):
 
     @abstractmethod
     def connect(
-        self, tick_s: float, part: float, acted: dict[int, bool], holds: Callable[[], bool]
+        self,
+        tick_s: float,
+        speed_fraction: float,
+        acted: dict[int, bool],
+        holds: Callable[[], bool],
     ) -> ArmLinks:
         """Return the links through which the servo level drives the arm.
 
         Args:
             tick_s: Duration of a tick, s.
-            part: Fraction of their limits below which velocities are kept.
+            speed_fraction: Fraction of their limits below which velocities are kept.
             acted: Collects the faults that have an effect, for `Executor.acted`.
             holds: Returns True if the gripper may hold an object, as far as the level knows.
 
@@ -167,12 +171,12 @@ class DrivableArm(ABC):
         """
 
     @abstractmethod
-    def permit(self, part: float) -> None:
+    def permit(self, speed_fraction: float) -> None:
         """Change the fraction of their limits below which the link keeps velocities."""
 
     @classmethod
     @abstractmethod
-    def misfit(cls, cell: Cell, part: float) -> str:
+    def misfit(cls, cell: Cell, speed_fraction: float) -> str:
         """Return why `connect` would fail for a cell. Empty if it would not.
 
         Called before the launch.

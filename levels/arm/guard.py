@@ -18,15 +18,15 @@ from rack.levels.robot.dynamics import Dynamics
 from rack.levels.robot.limits import Bounds
 
 
-def kept_bounds(cell: Cell, part: float) -> Bounds:
+def kept_bounds(cell: Cell, speed_fraction: float) -> Bounds:
     """Return the bounds of a cell, narrowed by the error of the encoders.
 
-    `part` is the fraction of their limits below which velocities are kept.
+    `speed_fraction` is the fraction of their limits below which velocities are kept.
 
     Raises:
         RobotError: The encoders are too coarse to detect a violated limit.
     """
-    velocity = part * cell.bounds.velocity
+    velocity = speed_fraction * cell.bounds.velocity
     off = cell.encoders.off
     speed_off = cell.encoders.speed_off
     bounds = Bounds(
@@ -59,7 +59,7 @@ class GuardedArm:
     """
 
     def __init__(
-        self, arm: BrakedArm, tick_s: float, below: Link | None = None, part: float = 1.0
+        self, arm: BrakedArm, tick_s: float, below: Link | None = None, speed_fraction: float = 1.0
     ) -> None:
         """Guard an arm.
 
@@ -67,7 +67,7 @@ class GuardedArm:
             arm: The arm.
             tick_s: Duration of a tick, s.
             below: Link that senses the arm. None if the arm is sensed directly.
-            part: Fraction of their limits below which velocities are kept.
+            speed_fraction: Fraction of their limits below which velocities are kept.
 
         Raises:
             RobotError: The encoders are too coarse to detect a violated limit.
@@ -80,20 +80,20 @@ class GuardedArm:
         self._last_set_point: Array = np.full((2, len(cell.dof)), np.nan)
         self._dynamics = Dynamics(cell)
         self._state: Sensed | None = None
-        self.permit(part)
+        self.permit(speed_fraction)
 
-    def permit(self, part: float) -> None:
-        """Keep velocities within `part` of their limits.
+    def permit(self, speed_fraction: float) -> None:
+        """Keep velocities within `speed_fraction` of their limits.
 
         Raises:
             RobotError: The encoders are too coarse to detect a violated limit.
         """
         cell = self._cell
-        bounds = kept_bounds(cell, part)
+        bounds = kept_bounds(cell, speed_fraction)
         off = cell.encoders.off
         self._low = cell.bounds.position[:, 0] - off
         self._high = cell.bounds.position[:, 1] + off
-        self._fastest = part * cell.bounds.velocity + cell.encoders.speed_off
+        self._fastest = speed_fraction * cell.bounds.velocity + cell.encoders.speed_off
         self._gate = LimitGate(bounds, cell.limits.acceleration, self._span_s, self._dynamics)
         if cell.interface != "torque":
             last = self._last_set_point
