@@ -211,6 +211,7 @@ class _Kept:
             )
 
     def _path(self, types: Any, codegen: Any) -> Path:
+        """Return the path of the file for a tuple of types."""
         from numba import __version__
 
         build = repr((__version__, sys.version, types, codegen.magic_tuple())).encode()
@@ -218,6 +219,7 @@ class _Kept:
 
 
 def _instructions(code: CodeType, docstring: str | None = None) -> Iterator[bytes]:
+    """Yield the bytecode, names and constants of a function, without its docstring."""
     yield code.co_code
     yield repr((code.co_names, code.co_varnames)).encode()
     for constant in code.co_consts:
@@ -228,6 +230,7 @@ def _instructions(code: CodeType, docstring: str | None = None) -> Iterator[byte
 
 
 def _value(value: object) -> Iterator[bytes]:
+    """Yield a representation of a value that compiled code uses as a constant."""
     match value:
         case compiled():
             yield from value.source()

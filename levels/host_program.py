@@ -184,9 +184,9 @@ class HostProgram:
         cls.outputs = collect_ports(cls, "outputs", (Output,))
         for port in (*cls.inputs.values(), *cls.outputs.values()):
             if not isinstance(port, ProgramInput | ProgramOutput):
-                why = f"port '{port.name}' is a level's {type(port).__name__}"
                 raise LevelError(
-                    f"class {cls.__name__}: {why}; it must be a ProgramInput or ProgramOutput"
+                    f"class {cls.__name__}: port '{port.name}' is a level's {type(port).__name__};"
+                    " it must be a ProgramInput or ProgramOutput"
                 )
 
     def __init__(self, context: LevelContext) -> None:

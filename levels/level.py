@@ -329,9 +329,12 @@ class LevelSection:
         vars(self)[name] = value
 
     def _check_is_free(self, name: str) -> None:
+        """Check that the constructor has not used the name of a port for something else."""
         if not isinstance(vars(self).get(name, {}), Reading | Message | dict):
-            why = f"attribute '{name}' has the name of a port; rename the attribute"
-            raise LevelError(f"class {type(self).__name__}: {why}")
+            raise LevelError(
+                f"class {type(self).__name__}: attribute '{name}' has the name of a port; rename"
+                " the attribute"
+            )
 
     @classmethod
     def preload(cls) -> None:
@@ -413,8 +416,10 @@ class Executor(LevelSection, ABC):
                 raise LevelError(f"class {cls.__name__}: finding '{name}' {kind.mistake}")
         if "operator" not in cls.inputs and live_keys(cls.params):
             if hasattr(cls, "operator"):
-                why = "attribute 'operator' has the name of the port that sets live parameters"
-                raise LevelError(f"class {cls.__name__}: {why}; rename the attribute")
+                raise LevelError(
+                    f"class {cls.__name__}: attribute 'operator' has the name of the port that sets"
+                    " live parameters; rename the attribute"
+                )
             cls.inputs = {**cls.inputs, OPERATOR.name: OPERATOR}
             cls.commands = {Operation.SET: ()}
 
@@ -464,6 +469,7 @@ class Executor(LevelSection, ABC):
             self._live_orders.report(status)
 
     def _set(self, command: OperatorCommand) -> None:
+        """Set a live parameter, or refuse the command."""
         self.settings, why = set_live(self.settings, command.name)
         if why:
             self._live_orders.refuse(why)

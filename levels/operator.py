@@ -242,6 +242,7 @@ class Orders:
         return taken
 
     def _take_up(self, message: OperatorCommand) -> bool:
+        """Accept or refuse a new command; return True if it is accepted."""
         # A clock board that is restarted while it gives a command gives it again.
         if message.id <= self.serial:
             return False
@@ -303,6 +304,7 @@ class Orders:
         return f"{board} {effect} by the operator: `resume` releases it" if effect else ""
 
     def _answer(self, answer: Answer, why: str = "") -> None:
+        """Change the answer to the command in force."""
         self._in_force = _Told(self.in_force, answer, why)
         self._tell(self._in_force)
 

@@ -276,8 +276,10 @@ def collect_ports(level: type, attribute: str, kinds: tuple[type, ...]) -> dict[
             in a dict, as before version 0.3.
     """
     if attribute in vars(level):
-        why = f"'{attribute}' is no longer a dict: each port is an attribute of the class"
-        raise LevelError(f"class {level.__name__}: {why}, as in status = Output(MyStatus)")
+        raise LevelError(
+            f"class {level.__name__}: '{attribute}' is no longer a dict: each port is an attribute"
+            " of the class, as in status = Output(MyStatus)"
+        )
     noun = "finding" if FindingKind in kinds else "port"
     known: dict[str, Any] = {}
     for base in reversed(level.__mro__[1:]):
@@ -286,14 +288,18 @@ def collect_ports(level: type, attribute: str, kinds: tuple[type, ...]) -> dict[
     for name, value in vars(level).items():
         if isinstance(value, kinds):
             if name not in known and any(hasattr(base, name) for base in level.__bases__):
-                why = f"{noun} '{name}' has the name of another attribute"
-                raise LevelError(f"class {level.__name__}: {why}; rename the {noun}")
+                raise LevelError(
+                    f"class {level.__name__}: {noun} '{name}' has the name of another attribute;"
+                    f" rename the {noun}"
+                )
             # A port that is declared again moves to the class's own ports.
             ports.pop(name, None)
             ports[name] = value
         elif name in known and value is None:
             del ports[name]
         elif name in known:
-            why = f"attribute '{name}' has the name of a {noun}"
-            raise LevelError(f"class {level.__name__}: {why}; rename the attribute")
+            raise LevelError(
+                f"class {level.__name__}: attribute '{name}' has the name of a {noun}; rename the"
+                " attribute"
+            )
     return ports

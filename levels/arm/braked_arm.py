@@ -138,6 +138,7 @@ class BrakedArm(Plant, DrivableArm):
                 self.findings.append(Finding(Alarm.BRAKES_OPENED, why, self.tick - since))
 
     def _report_brakes(self, why: int, since: int, missed: int = 0) -> None:
+        """Report that the brakes engaged at tick `since`, with `missed` ticks without command."""
         self._brakes = why, since
         self.findings.append(Finding(Alarm.BRAKES_CLOSED, why, missed, since))
 

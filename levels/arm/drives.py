@@ -123,6 +123,7 @@ class LimitGate:
         )
 
     def _speed_towards(self, distance: Array, speed: Array) -> Array:
+        """Return the highest permitted speed towards an end of the range, (joints,), rad/s."""
         return speed_towards(distance, speed, self._fastest, self._braking, self._period_s)
 
 

@@ -80,6 +80,7 @@ class FaultyLink:
         self._arm.weaken(max_torque if self._motors else None)
 
     def _joints(self, fault: Fault) -> Mask:
+        """Return a mask of the joints that a fault affects, (joints,)."""
         joints = np.arange(len(self._limits))
         return np.asarray((joints == fault.joint) | (fault.joint < 0))
 
@@ -130,6 +131,7 @@ class FaultyLink:
         )
 
     def _corrupt(self, torque: Array) -> Array:
+        """Return the torques as the active command faults corrupt them, (joints,), N m."""
         corrupt = self._torque
         np.copyto(corrupt, torque)
         for step, active in self._commands:

@@ -137,6 +137,10 @@ class GuardedArm:
         return passed if isinstance(passed, Finding) else self._below.follow(passed, grip_force)
 
     def _judge(self, sample: Sensed) -> None:
+        """Set the arm's `exceeded` to the limit that a sample exceeds, or to None.
+
+        A violation while the drives are enabled is counted and reported.
+        """
         q = sample.position
         # The conditions are negated so that NaN counts as a violation.
         is_outside = ~((q >= self._low) & (q <= self._high))

@@ -57,7 +57,8 @@ class SimulatedArm(Simulation, Arm):
         self.begin(scene, clock_ns)
         self._gripper = cell.gripper
         dynamics = self.dynamics
-        self._gate = LimitGate(cell.bounds, cell.limits.acceleration, clock_ns * 1e-9, dynamics)
+        tick_s = clock_ns * 1e-9
+        self._gate = LimitGate(cell.bounds, cell.limits.acceleration, tick_s, dynamics)
         self._rest: Array = cell.begin.copy()  # (joints,), rad: held by the brakes
         self._most: Array | None = None  # (joints,), N m: limits of weakened motors
         self._coarse = None if cell.encoders.exact else CoarseSensors(cell.encoders, seed)
@@ -70,11 +71,11 @@ class SimulatedArm(Simulation, Arm):
         self._given = False  # True if the command for the coming tick has passed the gate
         self._drives: CascadedDrives | None = None  # None if drives take torques
         if cell.interface != "torque":
-            tick_s = clock_ns * 1e-9
             rows = d.userdata[-SET_POINT_ROWS * joints :].reshape(SET_POINT_ROWS, joints)
             self._drives = CascadedDrives(cell, dynamics, tick_s, every, rows)
-            span_s = self.patience * tick_s
-            self._set_points = SetPointGate(self, cell.bounds, tick_s, span_s, rows[:2])
+            self._set_points = SetPointGate(
+                self, cell.bounds, tick_s, self.patience * tick_s, rows[:2]
+            )
             self.reports_torque = every == 1
         # Until the first step, the wrist sensor must sense a braked arm, not a falling one.
         if self._wrist is not None:
@@ -98,6 +99,7 @@ class SimulatedArm(Simulation, Arm):
         return self._samples[0] if self._samples else self._sampled()
 
     def _sampled(self) -> Sensed:
+        """Return a sample of the present state, with the errors of the encoders."""
         position, velocity = self._state
         if self._coarse is not None:
             position, velocity = self._coarse.sample(position, velocity, self.tick)
@@ -145,6 +147,7 @@ class SimulatedArm(Simulation, Arm):
         self._give()
 
     def _grip(self, force: float) -> None:
+        """Set the force of the gripper, N, unless it is not finite."""
         if self._gripper is not None and math.isfinite(force):
             self._data.ctrl[self._gripper.actuator] = self.grip_force = force
 
@@ -154,6 +157,7 @@ class SimulatedArm(Simulation, Arm):
         self._give()
 
     def _engage(self) -> None:
+        """Engage the brakes, and store the positions that they hold."""
         if not self.braked:
             self.braked = True
             np.copyto(self._rest, self._state[0])

@@ -208,6 +208,7 @@ def points_at(marks: Array, table: Array, places: Array) -> Array:
 
 
 def _checked(waypoints: ArrayLike, blend: ArrayLike) -> tuple[Array, Array]:
+    """Return waypoints and blends as arrays, after checking shapes and values."""
     points = np.array(waypoints, dtype=float)
     radii = np.array(blend, dtype=float)
     if points.ndim != 2 or len(points) == 0:
@@ -240,6 +241,7 @@ def _distinct(points: Array, radii: Array) -> tuple[Array, Array]:
 
 
 def _check_overlap(radii: Array, lengths: Array) -> None:
+    """Check that neighbouring blends fit on the line between them."""
     for k, length in enumerate(lengths):
         if radii[k] + radii[k + 1] > length * (1.0 + OVERLAP_ROUNDING) + COINCIDENT_RAD:
             raise ValueError(

@@ -314,6 +314,7 @@ def _sections(marks: Sequence[float], limits: Sequence[SpeedLimits]) -> Iterator
 
 
 def _ramp(state: PathState, acceleration: float, jerk: float) -> Trajectory:
+    """Return the fastest ramp from `state` to rest within `acceleration` and `jerk`."""
     request = _from(state, acceleration, jerk)
     request.control_interface = ruckig.ControlInterface.Velocity
     return _joined(_calculated(request), state.s)

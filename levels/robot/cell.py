@@ -137,6 +137,7 @@ def cell_of(context: LevelContext) -> Cell:
 
 @lru_cache(maxsize=4)
 def _compiled(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> Cell:
+    """Build and check a cell, and cache it for later calls in this process."""
     cell = unchecked_cell(robot, scene, clock_ns)
     for key, position in (("home", cell.home), ("start", cell.begin)):
         cell.model.key_qpos[0] = start_qpos(cell, position)

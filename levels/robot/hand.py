@@ -90,6 +90,7 @@ def check_hand(robot: RobotConfig, hand: HandConfig) -> None:
 
 
 def _check_fingers(robot: RobotConfig, hand: HandConfig) -> None:
+    """Check that fingers have distinct names, and that each joint belongs to one finger."""
     names = [finger.name for finger in hand.finger]
     for finger in hand.finger:
         if names.count(finger.name) > 1:
@@ -150,16 +151,18 @@ def fit_tendons(
         site = spec.site(finger.tip)
         if site is not None:
             site.parent.name = site.parent.name or f"tip of {finger.name}"
-            kind = mujoco.mjtSensor.mjSENS_CONTACT
-            body = mujoco.mjtObj.mjOBJ_BODY
             sensor = spec.add_sensor(
-                name=_force_of(finger), type=kind, reftype=body, refname=site.parent.name
+                name=_force_of(finger),
+                type=mujoco.mjtSensor.mjSENS_CONTACT,
+                reftype=mujoco.mjtObj.mjOBJ_BODY,
+                refname=site.parent.name,
             )
             sensor.intprm[:3] = NET_FORCE
     return list(hand.flexors), np.full(len(robot.joints), np.inf)
 
 
 def _force_of(finger: FingerConfig) -> str:
+    """Return the name of the force sensor at the tip of a finger."""
     return f"force on {finger.name}"
 
 
@@ -258,11 +261,9 @@ def _arms(model: mujoco.MjModel, robot: RobotConfig, actuators: Ints) -> Array:
         RobotError: Two tendons are not a pair of one joint, or their moment arm varies.
     """
     joints = np.array([model.joint(name).id for name in robot.joints])
+    home = np.array(robot.home)
     limited = model.jnt_limited[joints, None]
-    places = (
-        np.array(robot.home),
-        *np.where(limited, model.jnt_range[joints], np.array(robot.home)[:, None]).T,
-    )
+    places = (home, *np.where(limited, model.jnt_range[joints], home[:, None]).T)
     moments = np.array([actuator_moments(model, joints, place)[actuators] for place in places])
     # (places, 2, joints), m: arms of flexors and extensors, which turn joints back.
     arms = np.diagonal(moments, axis1=2, axis2=3) * np.array([[1.0], [-1.0]])

@@ -115,6 +115,7 @@ class TaskExecutor(Executor):
             self._detour.begin(command, command.id > answered)
 
     def _follow(self, plan: TaskPlan, below: MoveStatus) -> None:
+        """Count completed moves, and detect errors of the plan and the level below."""
         if plan.error:
             self._error = Error(plan.error)
             self._reason = plan.reason
@@ -169,6 +170,7 @@ class TaskExecutor(Executor):
         return ()
 
     def _actions_done(self, plan: TaskPlan) -> int:
+        """Return how many actions of the program are done."""
         if not plan.count:
             return 0
         if self._done == plan.count:
@@ -190,6 +192,7 @@ class TaskExecutor(Executor):
         return plan.count if self._detour.until is None else self._detour.until
 
     def _report(self, plan: TaskPlan, waits: str) -> None:
+        """Fill the status. `waits` is the reason to wait, or empty."""
         status = self.status
         status.echo = plan.id
         status.state = self._state(plan)
@@ -218,6 +221,7 @@ class TaskExecutor(Executor):
         orders.report(self.status)
 
     def _state(self, plan: TaskPlan) -> State:
+        """Return the state of the level, without holds."""
         if self._error:
             return State.ERROR
         if not self._actions:

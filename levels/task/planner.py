@@ -102,6 +102,7 @@ class TaskPlanner(Planner):
 
     @property
     def _slice(self) -> int:
+        """Ticks that the computation of a plan may take."""
         return self.context.within_cycles * self.context.every
 
     def _is_on_its_way(self, tick: int, since: int) -> bool:
@@ -116,6 +117,7 @@ class TaskPlanner(Planner):
         return self.made.message.id == self._id or 0 < since <= tick < since + self._slice
 
     def _decompose(self, tick: int) -> None:
+        """Rehearse the program and write its moves into `output`. Raises `Refused`."""
         from rack.levels.task.actions import rehearse
 
         world = self.world.message

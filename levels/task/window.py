@@ -103,6 +103,7 @@ class ShownWindow:
         self._end(command, 1)
 
     def _end(self, command: TaskCommand, count: int) -> None:
+        """Set the count and id of a window, and clear its unused moves."""
         command.count = count
         # Unused moves are cleared, so that equal windows have equal bytes.
         command.moves[count:] = np.zeros((), command.moves.dtype)
@@ -211,6 +212,7 @@ class Detour:
         return Move(self.move, action, verb, None, tool, joints, False, 0.0)
 
     def _follow(self, below: MoveStatus) -> None:
+        """Report that the goto is done or has failed, when the level below reports it."""
         if below.done >= self.move:
             self._orders.done()
         elif below.state == State.ERROR and below.done >= self._window.before:
