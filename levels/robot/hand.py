@@ -262,8 +262,8 @@ def _arms(model: mujoco.MjModel, robot: RobotConfig, actuators: Ints) -> Array:
     """
     joints = np.array([model.joint(name).id for name in robot.joints])
     home = np.array(robot.home)
-    limited = model.jnt_limited[joints, None]
-    places = (home, *np.where(limited, model.jnt_range[joints], home[:, None]).T)
+    ranges = np.where(model.jnt_limited[joints, None], model.jnt_range[joints], home[:, None])
+    places = (home, *ranges.T)
     moments = np.array([actuator_moments(model, joints, place)[actuators] for place in places])
     # (places, 2, joints), m: arms of flexors and extensors, which turn joints back.
     arms = np.diagonal(moments, axis1=2, axis2=3) * np.array([[1.0], [-1.0]])

@@ -74,10 +74,9 @@ def find_wrist(model: mujoco.MjModel, config: WristConfig | None, moved: Mask) -
                 f"robot.wrist.most_{key}: {limit:g} {unit} is beyond the sensor's range; it"
                 f" must be at most {reach:g}"
             )
-    addresses = model.sensor_adr[sensors]
     return Wrist(
         site=force,
-        addresses=(addresses[:, None] + np.arange(3)).ravel().astype(int),
+        addresses=(model.sensor_adr[sensors, None] + np.arange(3)).ravel().astype(int),
         range=(reaches[0], reaches[1]),
         most=contact_limits,
         noise=(config.noise, 0.1 * config.noise),
