@@ -227,7 +227,7 @@ def test_during_bring_up_torques_keep_the_reduced_speed(tmp_path: Path) -> None:
     robot = pendulum(tmp_path)
     cell = build_cell(robot, SceneConfig(), CLOCK_NS)
     arm = IdealArm(cell, SceneConfig(), CLOCK_NS)
-    guard = GuardedArm(arm, TICK_S, part=0.1)
+    guard = GuardedArm(arm, TICK_S, speed_fraction=0.1)
     _, slow = drive_cycles(guard, arm, random_torques(cell, 0, 800))
     assert (np.abs(slow) / cell.bounds.velocity).max() <= 0.1
     assert (arm.violations, arm.clipped > 50) == (0, True)
