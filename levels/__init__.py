@@ -1,22 +1,24 @@
-"""Virtual control loops: the public API of a level's author. `rack.levels.level` describes what a
-level must do.
+"""Virtual control loops: the public API for authors of levels.
+
+`rack.levels.level` describes the duties of a level.
 
 - Write a level: `Executor`, `Planner`, with the ports `Input`, `Inputs`, `Output`, `QueuedOutput`
   and `TimedOutput`, with `Reading`, `Verdict`, `Program`, `LevelContext`, `Pace`.
-- Declare messages: `Message`, `Command`, `Status`, `field`, `State`; the default levels' messages
-  are in `rack.levels.messages`, and their error codes in `Error`.
-- Declare parameters: `Table`, `Positive`, `Finite`, `Live`, `read_params`, `set_live`; arm and
-  cell: `RobotConfig`, `SceneConfig`.
+- Declare messages: `Message`, `Command`, `Status`, `field`, `State`. The messages of the default
+  levels are in `rack.levels.messages`, their error codes in `Error`.
+- Declare parameters: `Table`, `Positive`, `Finite`, `Live`, `read_params`, `set_live`. Arm and
+  cell are described by `RobotConfig` and `SceneConfig`.
 - Obey an operator: `Orders`, `Operation`, `Goal`, `Commands`, `OperatorCommand`, `AnsweringStatus`,
   `RelayedCommand`.
-- Protect the arm: `Demand` from the rack, `Finding` with an `Alarm` to it, `Fault` injected.
-- Report events of its own: `FindingKind`, and `raise_finding` of an executor.
-- Fail: `LevelError`, `RobotError`, `ProgramError`, `Refused`.
+- Protect the arm: obey a `Demand` of the rack, report a `Finding` with an `Alarm`, and apply an
+  injected `Fault`.
+- Report events: declare a `FindingKind` and call `Executor.raise_finding`.
+- Raise errors: `LevelError`, `RobotError`, `ProgramError`, `Refused`.
 
-Import the rest by module, since MuJoCo takes half a second: `rack.levels.algebra` (arithmetic with
-the same bits on every processor), `rack.levels.robot` (cell, limits, dynamics), `rack.levels.arm`
-(the arm's interface), and the default levels: `servo`, `primitive`, `elemental_move`, `task`,
-`world`, `figures`.
+Import everything else from its module, because MuJoCo takes half a second to import:
+`rack.levels.algebra` (arithmetic with the same bits on every processor), `rack.levels.robot` (cell,
+limits, dynamics), `rack.levels.arm` (the arm's interface), and the default levels: `servo`,
+`primitive`, `elemental_move`, `task`, `world`, `figures`.
 """
 
 from __future__ import annotations
@@ -156,5 +158,6 @@ _PLACES = {
     ),
 }
 
-if not TYPE_CHECKING:  # a type checker would take every misspelt name for one of these
+# A type checker would accept every misspelt name if it saw `__getattr__`.
+if not TYPE_CHECKING:
     __getattr__ = on_first_use(__name__, _PLACES)

@@ -1,18 +1,18 @@
 """Arithmetic that gives the same bits on every processor.
 
-A lockstep run repeats bit for bit, on another machine too. Numpy does not promise that: its BLAS
+A lockstep run repeats bit for bit, even on another machine. Numpy does not guarantee that: its BLAS
 (`@`, `np.dot`, `np.linalg`) sums in an order that depends on the processor's vector unit, and many
 of its functions (`tanh`, `exp`, `arctan2`, `arccos`, `**` with exponents other than 2) have a
-variant for each. Levels use these instead:
+variant for each vector unit. Levels use the following instead:
 
-- products, solutions and lengths from MuJoCo: compiled once, without choices at run time, and about
-  as fast as BLAS for a few joints;
-- transcendental functions from `math`: the C library's, of which the crate fixes the variant for
-  all boards.
+- Products, solutions and lengths come from MuJoCo. It is compiled once, makes no choices at run
+  time, and is about as fast as BLAS for a few joints.
+- Transcendental functions come from `math`, which calls the C library. The crate selects the same
+  variant for all boards.
 
-Numpy's + - * / and sqrt, element by element, are exact by IEEE 754; its sums, norms over an axis,
-and sorting of values have one order on all x86-64 processors. Alternatives considered: `np.einsum`,
-fixed too, but twice the time.
+Numpy's elementwise + - * / and sqrt are exact by IEEE 754. Its sums, norms over an axis, and
+sorting of values use the same order on all x86-64 processors. Alternative considered: `np.einsum`
+has a fixed order as well, but takes twice the time.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def transposed_mat_vec(matrix: Array, vector: Array) -> Array:
 
 
 def gram(matrix: Array) -> Array:
-    """Return the transpose of `matrix` (m, n) times `matrix`, (n, n)."""
+    """Return `matrix` (m, n) transposed times itself, (n, n)."""
     columns = matrix.shape[1]
     product = np.empty((columns, columns))
     mujoco.mju_mulMatTMat(product, matrix, matrix)
@@ -54,8 +54,9 @@ def gram(matrix: Array) -> Array:
 
 
 def solve(matrix: Array, vector: Array) -> Array:
-    """Return x (n,) with `matrix` x = `vector`; `matrix` (n, n) is symmetric and positive definite,
-    like an inertia.
+    """Solve `matrix` x = `vector` for x (n,).
+
+    `matrix` (n, n) must be symmetric and positive definite, like an inertia matrix.
     """
     factor = matrix.copy()
     solution = np.empty(len(vector))
@@ -70,7 +71,7 @@ def norm(vector: ArrayLike) -> float:
 
 
 def each(function: Callable[[float], float], values: Array) -> Array:
-    """Return `function`, one of `math`, of every element of `values`, in its shape."""
+    """Apply a function of `math` to every element of `values`; the shape stays the same."""
     return np.fromiter(map(function, values.ravel().tolist()), float, values.size).reshape(
         values.shape
     )

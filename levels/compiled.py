@@ -1,15 +1,16 @@
 """Small fixed-size algebra as machine code: a Python function that numba compiles at its first use.
 
-A few hundred numpy calls on six numbers were most of a servo cycle: each costs a microsecond,
-whatever it computes. A function marked `@compiled` is ordinary numpy code; called directly it runs
-as such, the reference of its tests. One marked with its types, `@compiled_for`, can be loaded
-before a run: see `Executor.preload`. Alternatives considered: a C extension (users would need a
-compiler), `jit` at import (numba takes 0.4 s to import, and most commands compute nothing).
+A few hundred numpy calls on six numbers took most of a servo cycle: each costs a microsecond,
+whatever it computes. A function marked `@compiled` is ordinary numpy code. Called directly, it runs
+as such, and tests compare the machine code with it. A function marked `@compiled_for` states its
+argument types, so that its machine code can be loaded before a run: see `Executor.preload`.
+Alternatives considered: a C extension (users would need a compiler), `jit` at import (numba takes
+0.4 s to import, and most commands compute nothing).
 
-Without `fastmath` the order of operations is the source's, so the bits do not depend on the
-processor. Compiled code is kept from run to run. numba's own cache was rejected: it fails on a
-damaged file, runs code with flipped bits, and notices a change in the function, not in those that
-it calls.
+Without `fastmath` the order of operations is the order in the source, so the bits do not depend on
+the processor. Compiled code is kept from run to run. numba's own cache was rejected: it fails on a
+damaged file, runs code with flipped bits, and notices a change of the function itself, but not of
+the functions that it calls.
 """
 
 from __future__ import annotations
@@ -29,8 +30,8 @@ from typing import Any, Generic, ParamSpec, TypeVar
 import numpy as np
 
 DIGEST = 16
-"""Bytes of a digest."""
-CURE = "XDG_CACHE_HOME=FOLDER names one that can be written"
+"""Length of a digest, bytes."""
+CURE = "set XDG_CACHE_HOME to a folder that can be written"
 _P = ParamSpec("_P")
 _R = TypeVar("_R", covariant=True)
 _A = ParamSpec("_A")
@@ -38,12 +39,14 @@ _T = TypeVar("_T")
 
 
 on_compile: Callable[[str], object] | None = None
-"""Called with the name of each function before it is compiled, which takes seconds."""
+"""Called with the name of a function before it is compiled, which takes seconds."""
 
 
 class compiled(Generic[_P, _R]):  # noqa: N801  # a decorator
-    """Mark a function for compilation. Arguments are numbers, arrays and records; it may call
-    others marked so.
+    """Decorator that marks a function for compilation.
+
+    Arguments are numbers, arrays and records. The function may call other functions marked
+    likewise.
     """
 
     def __init__(
@@ -55,21 +58,23 @@ class compiled(Generic[_P, _R]):  # noqa: N801  # a decorator
         self._machine: Callable[_P, _R] | None = None
 
     def __call__(self, *args: _P.args, **kwargs: _P.kwargs) -> _R:
-        """Call the function under numpy, and those that it calls: the reference of the compiled
-        one.
+        """Call the Python function, uncompiled, which calls other marked functions uncompiled.
+
+        Tests compare the machine code with this.
         """
         return self._function(*args, **kwargs)
 
     def load(self) -> Callable[_P, _R]:
-        """Return the compiled function; it is compiled, or read from the cache, at the first call
-        with its types.
+        """Return the compiled function.
+
+        It is compiled, or read from the cache, at its first call with given argument types.
         """
         if self._machine is None:
             self._machine = _jit(self)
         return self._machine
 
     def preload(self) -> None:
-        """Load the machine code for the types with which the function is marked, if any."""
+        """Load the machine code for the types given in `compiled_for`, if any."""
         if self._types:
             from numba import from_dtype
             from numba.core.sigutils import normalize_signature
@@ -81,8 +86,10 @@ class compiled(Generic[_P, _R]):  # noqa: N801  # a decorator
             machine.compile(types)
 
     def source(self) -> Iterator[bytes]:
-        """Yield what determines the machine code: instructions, constants, and the values of names,
-        functions that are called included. Comments, docstrings and places in files do not.
+        """Yield everything that determines the machine code.
+
+        This includes instructions, constants, and the values of names, also in functions that are
+        called. It excludes comments, docstrings and line numbers.
         """
         function: Any = self._function
         code = function.__code__
@@ -90,7 +97,7 @@ class compiled(Generic[_P, _R]):  # noqa: N801  # a decorator
         yield from _instructions(code, function.__doc__)
         yield repr(function.__defaults__).encode()
         for name in code.co_names:
-            # Others are attributes, or Python's own.
+            # Other names are attributes or builtins.
             if name in known:
                 yield name.encode()
                 yield from _value(known[name])
@@ -102,16 +109,16 @@ def compiled_for(
     """Mark a function for compilation, before a run, for arguments of these types.
 
     Args:
-        types: Types as numba writes them: "f8, i8, f8[:, ::1]" are a float, an integer and an
-            array in C order.
-        records: Type of the structured array, in one dimension, that is the first argument; None:
-            there is none, and `types` are those of all arguments.
+        types: Types as numba writes them: "f8, i8, f8[:, ::1]" are a float, an integer and an array
+            in C order.
+        records: Type of the one-dimensional structured array that is the first argument; `types`
+            are then the types of the other arguments. None if all arguments are in `types`.
     """
     return lambda function: compiled(function, types, records)
 
 
 def preload(*modules: ModuleType) -> None:
-    """Load the machine code of all functions in modules that are marked with types."""
+    """Load the machine code of all functions in `modules` that are marked with types."""
     for module in modules:
         for function in [*vars(module).values()]:
             if isinstance(function, compiled):
@@ -119,11 +126,12 @@ def preload(*modules: ModuleType) -> None:
 
 
 def _jit(marked: compiled[..., Any]) -> Any:
-    """Compile a function; those that it calls, if marked, are replaced by their compiled selves."""
+    """Compile a function. Marked functions that it calls are replaced by their compiled form."""
     from numba import config, njit
 
-    # NUMBA_DISABLE_JIT is for a user's own functions: these call the C library's by address.
-    config.DISABLE_JIT = 0  # type: ignore[attr-defined]  # numba makes it
+    # NUMBA_DISABLE_JIT is meant for a user's own functions. Ours call C functions by address.
+    # numba creates the attribute at run time.
+    config.DISABLE_JIT = 0  # type: ignore[attr-defined]
     function: Any = marked._function
     known = function.__globals__
     called = {
@@ -138,15 +146,16 @@ def _jit(marked: compiled[..., Any]) -> Any:
     bound.__qualname__ = function.__qualname__
     machine = njit(error_model="numpy")(bound)
     name = f"{function.__module__}.{function.__qualname__}"
-    machine._cache = _Kept(name, _digest(b"".join(marked.source())))  # type: ignore[attr-defined]  # numba makes it
+    # numba creates the attribute at run time.
+    machine._cache = _Kept(name, _digest(b"".join(marked.source())))  # type: ignore[attr-defined]
     return machine
 
 
 class _Kept:
-    """The compiled code of one function: a file for each tuple of types, which begins with its
-    digest. numba asks it before it compiles, and gives it the result.
+    """Cache of the machine code of one function, which numba consults before it compiles.
 
-    Files are replaced whole, so processes that compile the same at once do not disturb each other.
+    Each tuple of types has its own file, which begins with a digest of the rest. Files are replaced
+    as a whole, so that processes that compile the same function at once do not disturb each other.
     """
 
     def __init__(self, name: str, source: bytes) -> None:
@@ -154,11 +163,11 @@ class _Kept:
         self._source = source.hex()
 
     def load_overload(self, types: Any, target: Any) -> Any:
-        """Return the code for these types; None if there is none, or not as it was written."""
+        """Return the code for these types. None if it is missing or damaged."""
         from numba.core.compiler import CompileResult
 
         target.refresh()
-        # Without a home, or permission to read there, nothing is kept.
+        # Without a home folder, or permission to read it, there is no cache.
         with suppress(OSError):
             path = self._path(types, target.codegen())
             if path.is_file():
@@ -167,40 +176,42 @@ class _Kept:
                 # Damaged machine code must never run.
                 if content[:DIGEST] == _digest(code):
                     return CompileResult._rebuild(target, *pickle.loads(code))  # type: ignore[no-untyped-call]
-                _say(f"{path}: damaged; compiled again")
+                _say(f"{path} is damaged; the function is compiled again")
         if on_compile is not None:
             on_compile(self._name)
         return None
 
     def save_overload(self, types: Any, result: Any) -> None:
-        """Keep the code for these types, and none of an earlier state of the function; say so if
-        it cannot be kept.
+        """Save the code for these types and delete code of earlier versions of the function.
+
+        A message is printed if the code cannot be saved.
         """
         from numba.core.serialize import dumps
 
         if result.library.has_dynamic_globals:
-            # It holds addresses of this process.
+            # The code contains addresses of this process.
             return
         code: bytes = dumps(result._reduce())  # type: ignore[no-untyped-call]
         try:
             path = self._path(types, result.codegen)
-            part = path.with_name(f"{path.name}.{os.urandom(8).hex()}")
+            partial_file = path.with_name(f"{path.name}.{os.urandom(8).hex()}")
             path.parent.mkdir(parents=True, exist_ok=True)
             try:
-                part.write_bytes(_digest(code) + code)
-                part.replace(path)
+                partial_file.write_bytes(_digest(code) + code)
+                partial_file.replace(path)
             finally:
-                part.unlink(missing_ok=True)
+                partial_file.unlink(missing_ok=True)
             for old in path.parent.glob(f"{self._name}-*"):
                 if not old.name.startswith(f"{self._name}-{self._source}-"):
                     old.unlink(missing_ok=True)
         except OSError as error:
             _say(
-                "compiled code cannot be kept, and every launch compiles:"
+                "compiled code cannot be saved, so every launch compiles it again:"
                 f" {error.filename}: {error.strerror}; {CURE}"
             )
 
     def _path(self, types: Any, codegen: Any) -> Path:
+        """Return the path of the file for a tuple of types."""
         from numba import __version__
 
         build = repr((__version__, sys.version, types, codegen.magic_tuple())).encode()
@@ -208,6 +219,7 @@ class _Kept:
 
 
 def _instructions(code: CodeType, docstring: str | None = None) -> Iterator[bytes]:
+    """Yield the bytecode, names and constants of a function, without its docstring."""
     yield code.co_code
     yield repr((code.co_names, code.co_varnames)).encode()
     for constant in code.co_consts:
@@ -218,6 +230,7 @@ def _instructions(code: CodeType, docstring: str | None = None) -> Iterator[byte
 
 
 def _value(value: object) -> Iterator[bytes]:
+    """Yield a representation of a value that compiled code uses as a constant."""
     match value:
         case compiled():
             yield from value.source()
@@ -228,13 +241,15 @@ def _value(value: object) -> Iterator[bytes]:
         case bool() | int() | float() | str() | tuple() | np.dtype() | np.generic() | type():
             yield repr(value).encode()
         case _:
-            raise TypeError(f"{value!r} is no constant of compiled code")
+            raise TypeError(f"{value!r} cannot be a constant in compiled code")
 
 
 @cache
 def _folder() -> Path:
-    """Return the folder of the code that is compiled from this checkout. Raises `OSError` if the
-    user has no home folder.
+    """Return the folder of the code that is compiled from this checkout.
+
+    Raises:
+        OSError: The user has no home folder.
     """
     try:
         home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "nasrem-rack"
@@ -249,6 +264,6 @@ def _digest(content: bytes) -> bytes:
 
 @cache
 def _say(text: str) -> None:
-    """Print a line, once."""
+    """Print a line to stderr, once per process."""
     sys.stderr.write(f"{text}\n")
     sys.stderr.flush()

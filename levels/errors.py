@@ -1,12 +1,12 @@
-"""The exceptions of the levels, with an example of each.
+"""Exceptions of the levels, with an example of each.
 
 `LevelError` is the root.
 
-- `CannotGoOn`: another rack's adapter has a cycle of another length, in lockstep; its board is not
-  restarted.
-- `RobotError`: an MJCF file is missing or malformed; the model lacks a joint or a site.
+- `CannotGoOn`: in lockstep, the network adapter of another rack has a different cycle length. The
+  board is not restarted.
+- `RobotError`: an MJCF file is missing or malformed, or the model lacks a joint or a site.
 - `ProgramError`: a task program names an unknown object, verb or place.
-- `Refused`: a command cannot be carried out; a planner turns it into a status with its code and
+- `Refused`: a command cannot be carried out. A planner turns it into a status with its code and
   reason.
 """
 
@@ -14,11 +14,11 @@ from __future__ import annotations
 
 
 class LevelError(Exception):
-    """Root of every error this package raises; its text is one line for the user."""
+    """Root of all errors that this package raises. The text is one line for the user."""
 
 
 class CannotGoOn(LevelError):
-    """A level that cannot go on, and that a restart would not help."""
+    """A level that cannot continue, and that a restart would not help."""
 
 
 class RobotError(LevelError):
@@ -26,12 +26,15 @@ class RobotError(LevelError):
 
 
 class ProgramError(LevelError):
-    """A task program that cannot be understood."""
+    """A task program that is invalid."""
 
 
 class Refused(LevelError):
-    """A command that cannot be carried out: `code` is one of `rack.levels.messages.Error`,
-    `action` the number of the refused action, where a program has several.
+    """A command that cannot be carried out.
+
+    Attributes:
+        code: One of `rack.levels.messages.Error`.
+        action: Number of the refused action in a program. None if the command is not part of one.
     """
 
     def __init__(self, code: int, reason: str, action: int | None = None) -> None:

@@ -1,8 +1,8 @@
-"""Faults of what a level drives: the steps that spoil its samples, its motors and its commands.
+"""Faults of what a level drives: steps that corrupt its samples, its motors and its commands.
 
-A level lists in `Executor.faults` the classes of steps that it implements. Every kind of fault with
-a step of such a class can then strike it: a new kind needs no change in the level. The steps here
-are the project's own.
+A level lists in `Executor.faults` the classes of steps that it implements. Every fault kind with a
+step of such a class can then affect the level, so a new kind requires no change in the level. The
+steps below belong to the project's own fault kinds.
 """
 
 from __future__ import annotations
@@ -18,34 +18,40 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Key = tuple[str, int, int, int]
 Sample = Any
-"""A `rack.levels.arm.Sensed`: not imported, since that loads MuJoCo."""
+"""A `rack.levels.arm.Sensed`. It is not imported because that would import MuJoCo."""
 
 APART = np.array([[1e-2], [1e-2]])
-"""Error of a stuck sensor, rad and rad/s, from which it counts as wrong: while a joint creeps,
-nobody need notice it earlier."""
+"""Error of a stuck sensor, rad and rad/s, from which it counts as wrong.
+
+While a joint creeps, a stuck sensor need not be detected earlier.
+"""
 
 
 class Fault(NamedTuple):
-    """A fault injected into the arm, or another device that a level drives."""
+    """A fault injected into the arm, or into another device that a level drives."""
 
-    kind: str  # as in "sensor-nan"
-    parameters: Mapping[str, float]  # of the kind, by name
-    seed: int  # of its random numbers
+    kind: str  # name, such as "sensor-nan"
+    parameters: Mapping[str, float]  # by name
+    seed: int  # for its random numbers
     since: int  # tick at which it began
-    step: object  # acts the fault; of a class that the level lists in `faults`
+    step: object  # carries out the fault; its class is in `Executor.faults`
 
     @property
     def joint(self) -> int:
-        """The joint that it strikes, by index; -1: all."""
+        """Index of the joint that the fault affects. -1 for all joints."""
         return int(self.parameters.get("joint", -1))
 
 
 @dataclass(frozen=True)
 class ActiveFault:
-    """An injected fault. `place` is its index among those injected; `joints` (joints,) is True
-    where it strikes.
+    """An injected fault that is active.
 
-    `every` is the level's cycle in ticks; `kept` holds the first sample of each fault, by key.
+    Attributes:
+        place: Index among the injected faults.
+        fault: The fault.
+        joints: (joints,), True for joints that the fault affects.
+        every: Cycle of the level, ticks.
+        kept: First sample of each fault, by `key`.
     """
 
     place: int
@@ -56,7 +62,7 @@ class ActiveFault:
 
     @cached_property
     def key(self) -> Key:
-        """Identity of the fault, which stays the same when the set of injected faults changes."""
+        """Identity of the fault. It stays the same when other faults begin or end."""
         return (self.fault.kind, self.fault.seed, self.fault.since, int(self.joints.argmax()))
 
     def __getitem__(self, parameter: str) -> float:
@@ -64,7 +70,7 @@ class ActiveFault:
         return self.fault.parameters[parameter]
 
     def draw(self, tick: int) -> np.random.Generator:
-        """Return the random generator of one tick: a restarted board draws the same numbers."""
+        """Return the random generator of a tick; a restarted board draws the same numbers."""
         return np.random.default_rng((self.fault.seed, tick))
 
     def first(self, sample: Sample) -> Sample:
@@ -77,10 +83,11 @@ class ActiveFault:
 
 @dataclass(frozen=True)
 class SensorStep:
-    """Spoils a sample. `act` returns the spoilt sample, and whether that shows; None: it is the
-    truth.
+    """Fault step that corrupts a sample.
 
-    What shows must be found: the bound counts from there.
+    `act` returns the corrupted sample and whether the corruption is large enough to be detected, or
+    None if the sample still equals the truth. The detection bound counts from the first detectable
+    sample.
     """
 
     act: Callable[[Sample, ActiveFault], tuple[Sample, bool | None]]
@@ -88,8 +95,9 @@ class SensorStep:
 
 @dataclass(frozen=True)
 class MotorStep:
-    """Weakens motors. `part` returns the part of its torque limit that a motor still gives, 0 to
-    1.
+    """Fault step that weakens motors.
+
+    `part` returns the fraction of its torque limit that a motor still provides, 0 to 1.
     """
 
     part: Callable[[ActiveFault], float]
@@ -97,8 +105,9 @@ class MotorStep:
 
 @dataclass(frozen=True)
 class CommandStep:
-    """Corrupts the torques commanded. `act` takes torques and limits, N m, and returns torques
-    (joints,).
+    """Fault step that corrupts the commanded torques.
+
+    `act` takes torques and limits, N m, and returns torques, (joints,).
     """
 
     act: Callable[[Array, Array, ActiveFault], Array]
@@ -106,8 +115,9 @@ class CommandStep:
 
 @dataclass(frozen=True)
 class TendonStep:
-    """Tears a tendon of a hand, so that it gives no tension: that of `joint` on `side`, 0 flexor, 1
-    extensor.
+    """Fault step that tears a tendon of a hand, so that it has no tension.
+
+    Its parameters are `joint` and `side` (0 for the flexor, 1 for the extensor).
     """
 
 

@@ -1,9 +1,10 @@
-"""A program of the host side: no rate, no deadline, no real-time priority; it may block, import
-anything, and raise.
+"""A program on the host side.
 
-A host board is a process of its own under ordinary scheduling. The clock does not release it; real
-time never waits for it. It reaches the levels only through a bus adapter
-(`rack.boards.host.bus_adapter`), which exchanges at its own rate. The author writes `run`:
+It has no rate, no deadline and no real-time priority. It may block, import anything, and raise.
+
+A host board is a separate process under ordinary scheduling. The clock does not release it, and
+real time never waits for it. It reaches the levels only through a bus adapter
+(`rack.boards.host.bus_adapter`), which exchanges messages at its own rate. The author writes `run`:
 
     class Stroll(HostProgram):
         motion = ProgramInput(MotionStatus, "below.motion")
@@ -17,14 +18,14 @@ time never waits for it. It reaches the levels only through a bus adapter
             while self.motion.read().message.done < self.requests.sent:
                 bus.wait(1.0)
 
-The program is over when `run` returns. An exception ends the process, which is restarted by the
-rack's policy with a new object; serials of messages go on.
+The program ends when `run` returns. An exception ends the process, which is restarted by the
+rack's policy with a new object. The serials of its messages continue.
 
-In real time messages enter at ticks that depend on the program's timing; a replay with the recorded
-entries repeats a run. In lockstep the program runs while the rack's time stands still, until it
-waits in `bus.wait`; its computing takes the simulated time `[host.x] computing_ms`. Then a run
-repeats, if the program depends on its messages, `tick` and `time_s` alone. One that blocks
-elsewhere for 30 s ends the run. For prompts lockstep does not wait.
+In real time messages arrive at ticks that depend on the program's timing. A replay with the
+recorded entries repeats a run. In lockstep the program runs while the rack's time stands still,
+until it waits in `bus.wait`. Its computing takes the simulated time `[host.x] computing_ms`. Then a
+run repeats if the program depends only on its messages, `tick` and `time_s`. A program that blocks
+elsewhere for 30 s ends the run. Lockstep does not wait for interactive prompts.
 """
 
 from __future__ import annotations
@@ -43,82 +44,92 @@ M_co = TypeVar("M_co", bound=Message, covariant=True)
 
 
 class Bus(Protocol):
-    """The bus as a program of the host side sees it."""
+    """The bus as a host program sees it."""
 
     @property
     def tick(self) -> int:
-        """The clock's tick; in lockstep that of the adapter's cycle in which the program runs."""
+        """Tick of the clock; in lockstep, tick of the adapter cycle in which the program runs."""
 
     @property
     def time_s(self) -> float:
-        """Time since some moment, s: in lockstep simulated time, in real time that of
-        CLOCK_MONOTONIC.
-        """
+        """Time, s: simulated time in lockstep, CLOCK_MONOTONIC in real time."""
 
     @property
     def is_over(self) -> bool:
-        """Whether the run has ended: the program should return."""
+        """True when the run has ended; the program should then return."""
 
     def wait(self, timeout_s: float) -> bool:
-        """Wait until a message arrives; False when none has after the timeout, by `time_s`, or when
-        the run ends.
+        """Wait until a message arrives.
+
+        Returns:
+            False if none arrived within `timeout_s`, measured by `time_s`, or if the run ended.
         """
 
     @property
     def tasks(self) -> list[str]:
-        """Names of the crate's tasks."""
+        """Names of the tasks of the crate."""
 
     def address(self, name: str) -> int:
-        """Return the bus address of a mailbox, or of the control block of a task. Raises
-        `LookupError`.
+        """Return the bus address of a mailbox, or of the control block of a task.
+
+        Raises:
+            LookupError: No mailbox or task has this name.
         """
 
     def words(self, address: int, count: int = 1) -> list[int]:
-        """Return words of 8 bytes of the crate's memory, from a bus address on; `rack check` prints
-        addresses.
+        """Return 8-byte words of the crate's memory, starting at a bus address.
 
-        Any word may be read, whoever writes it, without a message; other boards may be writing it,
-        in lockstep too. Raises `ValueError` for an address that is no word's, or beyond the memory.
+        `rack check` prints the addresses. Any word may be read without a message, whichever board
+        writes it. Another board may be writing it at the same time, in lockstep too.
+
+        Raises:
+            ValueError: The address is not aligned to a word, or the words extend beyond the memory.
         """
 
     def finish(self) -> None:
-        """Declare the program's work done, as its return does."""
+        """Declare that the program has done its work, like returning from `run`."""
 
 
 class HostReceiver(Protocol[M_co]):
-    """An input of a host program at work."""
+    """Connected input of a host program."""
 
     def read(self) -> Reading[M_co]:
-        """Return the newest message; `earlier` holds the unread ones before it, as far as the
-        mailbox keeps them.
+        """Return the newest message.
+
+        The reading's `earlier` holds the unread messages before it that the mailbox still has.
         """
 
 
 class HostSender(Protocol[M_co]):
-    """An output of a host program at work."""
+    """Connected output of a host program."""
 
     @property
     def message(self) -> M_co:
-        """The next message: all its fields are 0, but for the `id` of a command, which is the
-        number of the message.
+        """The next message to send.
+
+        All its fields are 0, except the `id` of a command, which is the number of the message.
         """
 
     def send(self) -> bool:
-        """Send a copy of the message, and begin the next one; return False, and leave it as it is,
-        when too many wait at the adapter.
+        """Send a copy of the message and clear it for the next one.
+
+        Returns:
+            False if too many messages wait at the adapter. The message is then unchanged and not
+            sent.
         """
 
     @property
     def sent(self) -> int:
-        """Number of messages sent so far, by former processes of this board too."""
+        """Number of messages sent so far, also by earlier processes of this board."""
 
 
 class ProgramInput(InputPort[M]):
-    """A port that a host program reads: an attribute that is a `HostReceiver`.
+    """A port that a host program reads; the attribute is a `HostReceiver`.
 
     Args:
         message: The class of its messages.
-        source: A mailbox of a bus adapter, as in "below.motion". A config may wire it elsewhere.
+        source: A mailbox of a bus adapter, such as "below.motion". A config may connect another
+            one.
     """
 
     @overload
@@ -126,15 +137,16 @@ class ProgramInput(InputPort[M]):
     @overload
     def __get__(self, program: Any, owner: type) -> HostReceiver[M]: ...
     def __get__(self, program: Any, owner: type) -> Self | HostReceiver[M]:
-        """Return the declaration; a program that no board has connected can read nothing."""
+        """Return the declaration. Raises `LevelError` if no board has connected the program."""
         if program is None:
             return self
         raise self.not_connected()
 
 
 class ProgramOutput(Output[M]):
-    """A port that a host program writes, the mailbox `<board>.<port>`, for a bus adapter to read:
-    an attribute that is a `HostSender`.
+    """A port that a host program writes; the attribute is a `HostSender`.
+
+    A bus adapter reads its mailbox, `<board>.<port>`.
     """
 
     def __init__(self, message: type[M]) -> None:
@@ -145,24 +157,26 @@ class ProgramOutput(Output[M]):
     @overload
     def __get__(self, program: Any, owner: type) -> HostSender[M]: ...
     def __get__(self, program: Any, owner: type) -> Self | HostSender[M]:
-        """Return the declaration; a program that no board has connected can send nothing."""
+        """Return the declaration. Raises `LevelError` if no board has connected the program."""
         if program is None:
             return self
         raise self.not_connected()
 
 
 class HostProgram:
-    """A program of a host board. `context.every` is 1: it has no rate."""
+    """A program of a host board. It has no rate, so `context.every` is 1."""
 
     inputs: ClassVar[Mapping[str, ProgramInput[Any]]] = {}
-    """The ports that it reads, by name: collected from the class and its bases."""
+    """The ports that it reads, by name, collected from the class and its bases."""
     outputs: ClassVar[Mapping[str, ProgramOutput[Any]]] = {}
-    """The ports that it writes, likewise."""
+    """The ports that it writes, by name, collected likewise."""
     params: ClassVar[type[Table] | None] = None
-    """Keys of `[host.<name>.params]`, checked before the launch; None: unchecked, the program reads
-    them by itself."""
+    """Keys of `[host.<name>.params]`, checked before the launch.
+
+    None if the keys are not checked and the program reads them itself.
+    """
     program: ClassVar[type[Program] | None] = None
-    """Keys of `[task]`, checked before the launch; None: it reads no such program."""
+    """Keys of `[task]`, checked before the launch. None if it reads no task program."""
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
@@ -170,19 +184,19 @@ class HostProgram:
         cls.outputs = collect_ports(cls, "outputs", (Output,))
         for port in (*cls.inputs.values(), *cls.outputs.values()):
             if not isinstance(port, ProgramInput | ProgramOutput):
-                why = f"port '{port.name}' is a level's {type(port).__name__}"
                 raise LevelError(
-                    f"class {cls.__name__}: {why}; permitted: ProgramInput, ProgramOutput"
+                    f"class {cls.__name__}: port '{port.name}' is a level's {type(port).__name__};"
+                    " it must be a ProgramInput or ProgramOutput"
                 )
 
     def __init__(self, context: LevelContext) -> None:
         self.context = context
 
     def run(self, bus: Bus) -> None:
-        """Do the program's work; by default, do nothing until the run ends."""
+        """Do the program's work. The default does nothing until the run ends."""
         while not bus.is_over:
             bus.wait(1.0)
 
     def names(self, bus: Bus) -> Mapping[str, Any]:
-        """Return what a prompt offers by name, besides `bus` and `program`."""
+        """Return objects that an interactive prompt offers by name, besides `bus` and `program`."""
         return {}

@@ -1,8 +1,8 @@
-"""The messages of the default rack: commands go down, statuses come up, plans stay within a level.
+"""Messages of the default rack: commands go down, statuses come up, plans stay within a level.
 
-Symbolic sizes: `joints`, `bodies` (objects, then obstacles; at least 1) and `state` (of a simulated
-cell, see `rack.levels.robot.engine`). Quaternions are w, x, y, z. Poses are in the world frame.
-Simulated time is tick times the clock's period.
+Symbolic sizes are `joints`, `bodies` (objects, then obstacles; at least 1) and `state` (of a
+simulated cell, see `rack.levels.robot.engine`). Quaternions are w, x, y, z. Poses are in the world
+frame. Simulated time is the tick times the clock's period.
 """
 
 from __future__ import annotations
@@ -17,19 +17,23 @@ from rack.backplane.words import Demand
 from rack.levels.operator import AnsweringStatus, RelayedCommand
 
 WINDOW = 8
-"""Elemental moves in one task command: the level below never waits for a cycle of the task
-level."""
+"""Elemental moves in one task command.
+
+There are enough that the level below never waits for a cycle of the task level.
+"""
 SEGMENTS = 2
-"""Segments in one move command."""
+"""Number of segments in one move command."""
 WAYPOINTS = 24
-"""Most joint-space points of one path."""
+"""Maximum number of joint-space points of a path."""
 MOVES = 96
-"""Most elemental moves of one task program."""
+"""Maximum number of elemental moves of a task program."""
 SECTIONS_A_LINE = 8
-"""Sections of constant jerk for one line of a path and the corner after it: seven change speed, one
-keeps it."""
+"""Sections of constant jerk for one line of a path and the corner after it.
+
+Seven sections change the speed, and one keeps it.
+"""
 SECTIONS = SECTIONS_A_LINE * (WAYPOINTS - 1)
-"""Most sections of constant jerk of one trajectory."""
+"""Maximum number of sections of constant jerk of a trajectory."""
 
 
 class Error(IntEnum):
@@ -47,17 +51,17 @@ class Error(IntEnum):
     BELOW = 9
     TOUCHED = 10
     SENSORS = 11  # a sensor did not recover within its bound
-    BLOCKED = 12  # something stays in the way, after as many replans as permitted
-    OVERLOAD = 13  # more than motors or gripper can carry
+    BLOCKED = 12  # an obstacle remains after the maximum number of replans
+    OVERLOAD = 13  # the load exceeds what motors or gripper can carry
     STALLED = 14  # nothing has moved for the time that the task permits
-    MOTORS = 15  # a motor did not give its torque, however often it was retried
-    TABLE = 16  # a state table came to a row with status error
-    GIVEN_UP = 17  # the program of several racks was given up, for a reason in another one
-    FORCE = 18  # a contact stronger than the arm's limits
+    MOTORS = 15  # a motor did not produce its torque in any retry
+    TABLE = 16  # a state table reached a row with status error
+    GIVEN_UP = 17  # another rack made all racks give up their common program
+    FORCE = 18  # a contact exceeded the arm's limits of force
     CLIENT = 19  # a server's client is lost or silent
     CONTACT = 20  # a contact was not made, or was lost
-    DISABLED = 21  # the arm is not enabled yet, or no more: its operator enables it
-    DRIVES = 22  # the arm's drives report a fault: its operator resets it
+    DISABLED = 21  # the arm is not enabled; its operator has to enable it
+    DRIVES = 22  # the arm's drives report a fault; its operator has to reset it
 
 
 class Verb(IntEnum):
@@ -88,32 +92,32 @@ def per_joint(unit: str, doc: str) -> Any:
 class ElementalMove(Message, version=1):
     """One elemental move of a program."""
 
-    id: int = integer("serial of the move, rising by one from 1; 0: empty")
+    id: int = integer("serial of the move, rising by one from 1 (0: empty)")
     action: int = integer("index of the program's action that it serves", "u2")
     verb: Verb = field(doc="what to do")
-    object: int = integer("row of the object concerned in the world model; -1: none", "i2")
+    object: int = integer("row of the object concerned in the world model (-1: none)", "i2")
     position: ndarray = field(unit="m", doc="tool position at the end", shape=3)
     quaternion: ndarray = field(unit="1", doc="tool orientation at the end", shape=4)
     joints: ndarray = per_joint("rad", "where MOVE_JOINTS ends; with `posture`, near the end")
-    posture: bool = field(
-        doc="1: of the configurations at the pose, the one nearest to `joints` is wanted"
-    )
-    by: float = field(unit="s", doc="simulated time by which it must be done; 0: any time")
+    posture: bool = field(doc="1: select the configuration nearest to `joints` at the pose")
+    by: float = field(unit="s", doc="simulated time by which it must be done (0: any time)")
 
 
 class TaskPlan(Message, version=1):
-    """From the planner of the task level to its executor: the program, decomposed."""
+    """The task level's plan, from planner to executor: the program as elemental moves."""
 
     id: int = integer("serial of the plan")
-    error: Error = field("u2", doc="why the program is refused; 0: it is not refused")
+    error: Error = field("u2", doc="why the program is refused (0: not refused)")
     reason: str = field(doc="the refusal, readable")
-    earliest: float = field(unit="s", doc="with TOO_LATE: the earliest time that could be met")
+    earliest: float = field(
+        unit="s", doc="with TOO_LATE: the earliest time at which it could be done"
+    )
     count: int = integer("moves that follow", "u2")
     moves: ndarray = field(ElementalMove, doc="the program, decomposed", shape=MOVES)
 
 
 class TaskCommand(RelayedCommand, version=2):
-    """From the task level to the elemental move level: a window on the plan."""
+    """Command from the task level to the elemental move level: the next moves of the plan."""
 
     hold: bool = field(doc="1: ramp to rest and stay, whatever is under way")
     count: int = integer("moves that follow; id is the newest one's", "u2")
@@ -128,27 +132,25 @@ class TaskStatus(AnsweringStatus, version=2):
     moves_done: int = integer("elemental moves done", "u2")
     moves: int = integer("elemental moves of the plan; 0 before there is one", "u2")
     first: int = integer("id under which the plan's first move is handed down")
-    detour: int = integer("id of the move that an operator wants instead; 0: none")
+    detour: int = integer("id of the move that an operator requested instead (0: none)")
 
 
-OPERATED = field(doc="1: an operator keeps this level, or one below it, from its own work")
+OPERATED = field(doc="1: an operator keeps this level, or one below it, from its normal work")
 
 
 class MoveStatus(AnsweringStatus, version=3):
     """Status of the elemental move level."""
 
-    done: int = integer("newest elemental move done; 0: none yet")
-    current: int = integer("elemental move under way; 0: none")
+    done: int = integer("newest elemental move done (0: none yet)")
+    current: int = integer("elemental move under way (0: none)")
     progress: float = field(unit="1", doc="part of its path done, 0 to 1")
     verb: Verb = field(doc="of the move under way")
-    held: int = integer("row of the object in the gripper; -1: none", "i2")
-    planned: int = integer("newest elemental move whose path is ready; 0: none yet")
+    held: int = integer("row of the object in the gripper (-1: none)", "i2")
+    planned: int = integer("newest elemental move whose path is ready (0: none yet)")
     end: ndarray = per_joint("rad", "joint positions at the end of that path")
-    replan: int = integer(
-        "open request to plan the current move anew from `start`; 0: none is open"
-    )
+    replan: int = integer("open request to replan the current move from `start` (0: none)")
     start: ndarray = per_joint("rad", "joint positions where that motion holds")
-    replans: int = integer("plans made anew because something was in the way")
+    replans: int = integer("number of replans because of an obstacle")
     operated: bool = OPERATED
     resting: bool = field(
         doc="1: the arm rests, and the level that moves it has the operator's newest command"
@@ -156,11 +158,11 @@ class MoveStatus(AnsweringStatus, version=3):
 
 
 class MovePlan(Message, version=1):
-    """From the planner of the elemental move level to its executor: a path for one move."""
+    """The elemental move level's plan, from planner to executor: a path for one move."""
 
     move: int = integer("elemental move that the plan serves")
-    replan: int = integer("request that it answers; 0: the first plan of the move")
-    error: Error = field("u2", doc="why there is no plan; 0: there is")
+    replan: int = integer("request that it answers (0: the first plan of the move)")
+    error: Error = field("u2", doc="why there is no plan (0: there is a plan)")
     reason: str = field(doc="the error, readable")
     kind: SegmentKind = field(doc="path or gripper")
     count: int = integer("waypoints that follow", "u2")
@@ -177,10 +179,10 @@ class MovePlan(Message, version=1):
 class MoveSegment(Message, version=1, message="segment"):
     """One segment of a move: a path, or a motion of the gripper."""
 
-    id: int = integer("serial of the segment, rising by one from 1; 0: empty")
+    id: int = integer("serial of the segment, rising by one from 1 (0: empty)")
     move: int = integer("elemental move that it serves")
     kind: SegmentKind = field(doc="path or gripper")
-    object: int = integer("object held, or to be grasped; -1: none", "i2")
+    object: int = integer("object held, or to be grasped (-1: none)", "i2")
     touch: bool = field(doc="1: the object may touch supports and fingers (approach, depart)")
     count: int = integer("waypoints that follow", "u2")
     waypoints: ndarray = field(
@@ -189,13 +191,13 @@ class MoveSegment(Message, version=1, message="segment"):
         shape=(WAYPOINTS, "joints"),
     )
     blend: ndarray = field(unit="rad", doc="length over which corner k is rounded", shape=WAYPOINTS)
-    by: float = field(unit="s", doc="simulated time by which it must be done; 0: any time")
+    by: float = field(unit="s", doc="simulated time by which it must be done (0: any time)")
     opening: float = field(unit="m or rad", doc="gripper joint position to go to, for GRIPPER")
     force: float = field(unit="N or N m", doc="largest gripper force on the way and afterwards")
 
 
 class MoveCommand(RelayedCommand, version=2):
-    """From the elemental move level to the primitive level: the next segments."""
+    """Command from the elemental move level to the primitive level: the next segments."""
 
     hold: bool = field(doc="1: ramp to rest on the path and stay")
     count: int = integer("segments that follow; id is the newest one's", "u2")
@@ -205,30 +207,32 @@ class MoveCommand(RelayedCommand, version=2):
 class PrimitiveStatus(AnsweringStatus, version=3):
     """Status of the primitive level."""
 
-    done: int = integer("newest segment done; 0: none yet")
-    current: int = integer("segment under way; 0: none")
+    done: int = integer("newest segment done (0: none yet)")
+    current: int = integer("segment under way (0: none)")
     progress: float = field(unit="1", doc="part of the segment's path done, 0 to 1")
-    blocked: bool = field(doc="1: motion holds because something is in the way")
+    blocked: bool = field(doc="1: motion holds because of an obstacle")
     resting: bool = field(doc="1: commanded velocity is zero")
     operated: bool = OPERATED
-    held: int = integer("row of the object in the gripper; -1: none", "i2")
+    held: int = integer("row of the object in the gripper (-1: none)", "i2")
     opening: float = field(unit="m or rad", doc="gripper joint position, measured")
     position: ndarray = per_joint("rad", "joint positions commanded last")
-    earliest: float = field(unit="s", doc="with TOO_LATE: the earliest time that could be met")
-    ends: float = field(
-        unit="s", doc="simulated time at which the segment under way should be done; 0: not known"
+    earliest: float = field(
+        unit="s", doc="with TOO_LATE: the earliest time at which it could be done"
     )
-    wants: int = integer("segment for which the level wants a trajectory of its planner; 0: none")
+    ends: float = field(
+        unit="s", doc="simulated time at which the segment under way should be done (0: not known)"
+    )
+    wants: int = integer("segment for which the planner is to compute a trajectory (0: none)")
     begin: float = field(
         unit="rad", doc="path parameter at which that trajectory is to begin, from rest"
     )
 
 
 class TrajectoryPlan(Message, version=1, message="trajectory"):
-    """From the planner of the primitive level to its executor: when the arm is where on a path."""
+    """The primitive level's plan, from planner to executor: the timing of a path."""
 
     segment: int = integer("segment that it serves")
-    error: Error = field("u2", doc="why there is none; 0: there is")
+    error: Error = field("u2", doc="why there is no trajectory (0: there is one)")
     reason: str = field(doc="the error, readable")
     begin: float = field(unit="rad", doc="path parameter at which it begins")
     duration: float = field(unit="s", doc="from rest to rest")
@@ -244,21 +248,21 @@ class TrajectoryPlan(Message, version=1, message="trajectory"):
 
 
 class JointCommand(RelayedCommand, version=2, message="joint_set_point"):
-    """From the primitive level to the servo level: where the joints should be, and when."""
+    """Command from the primitive level to the servo level: a joint set point and its due tick."""
 
     due: int = field(
-        unit="tick", doc="tick at which the arm should be there; 0: no set point yet, hold"
+        unit="tick", doc="tick at which the set point applies (0: no set point yet, hold)"
     )
     position: ndarray = per_joint("rad", "joint positions")
     velocity: ndarray = per_joint("rad/s", "joint velocities")
     acceleration: ndarray = per_joint("rad/s2", "joint accelerations")
     opening: float = field(unit="m or rad", doc="gripper joint position to go to")
     force: float = field(unit="N or N m", doc="largest gripper force")
-    held: int = integer("row of the object in the gripper; -1: none", "i2")
+    held: int = integer("row of the object in the gripper (-1: none)", "i2")
 
 
 class ArmSetPoint(Protocol):
-    """What the servo level takes of a set point, of whichever message: see `JointCommand`."""
+    """Fields that the servo level reads from a set point message, such as `JointCommand`."""
 
     due: int
     position: ndarray
@@ -268,27 +272,27 @@ class ArmSetPoint(Protocol):
 
 
 class ServoPlan(Message, version=1):
-    """From the planner of the servo level to its executor: the inertia of arm and load."""
+    """The servo level's plan, from planner to executor: the inertia of arm and load."""
 
     inertia: ndarray = field(
         unit="kg m2",
         doc="joint-space inertia, the object held included",
         shape=("joints", "joints"),
     )
-    held: int = integer("object included; -1: none", "i2")
+    held: int = integer("object included (-1: none)", "i2")
     payload_mass: float = field(unit="kg", doc="mass in the gripper")
     payload_offset: ndarray = field(unit="m", doc="its centre, in the frame of the tool", shape=3)
 
 
 class DrivenArm(AnsweringStatus):
-    """Fields of the status of a level that drives an arm."""
+    """Base class for the status of a level that drives an arm."""
 
     position: ndarray = per_joint("rad", "joint positions, measured; estimated for suspect sensors")
     velocity: ndarray = per_joint("rad/s", "joint velocities, likewise")
     torque: ndarray = per_joint(
         "N m", "torque given to the arm in this cycle, after the limit gate"
     )
-    target: ndarray = per_joint("rad", "where the joints are wanted in this cycle")
+    target: ndarray = per_joint("rad", "set point of the joints in this cycle")
     target_velocity: ndarray = per_joint("rad/s", "likewise")
     opening: float = field(unit="m or rad", doc="gripper joint position, measured")
     opening_velocity: float = field(unit="m/s or rad/s", doc="gripper joint velocity, measured")
@@ -320,7 +324,9 @@ class ArmState(Message, version=3):
     touches: int = integer("unintended contacts")
     violations: int = integer("substeps in which the arm broke a limit")
     pushed: int = integer("substeps in which a blow pushed a joint beyond a limit")
-    struck: int = field("i4", unit="tick", doc="ticks for which the motion is still that of a blow")
+    struck: int = field(
+        "i4", unit="tick", doc="ticks for which the motion is still attributed to a blow"
+    )
     waited: int = field("i4", unit="tick", doc="ticks since the last command")
     braked: bool = field(doc="1: the brakes are engaged")
     rest: ndarray = per_joint("rad", "where engaged brakes hold the joints")
@@ -331,7 +337,7 @@ class ArmState(Message, version=3):
         unit="tick",
         doc="ticks for which faults have kept the arm from its set points: see ArmParams.patience",
     )
-    error: Error = field("u2", doc="latched fault; 0: none")
+    error: Error = field("u2", doc="latched fault (0: none)")
     reason: str = field(doc="that fault, readable")
     state: ndarray = field(
         unit="", doc="of the simulated cell, see rack.levels.robot.engine", shape="state"
@@ -339,7 +345,7 @@ class ArmState(Message, version=3):
 
 
 class Scene(Message, version=1):
-    """Bodies and tool as sensed."""
+    """Sensed poses of bodies and tool."""
 
     position: ndarray = field(unit="m", doc="body origins as sensed", shape=("bodies", 3))
     quaternion: ndarray = field(unit="1", doc="body orientations as sensed", shape=("bodies", 4))
@@ -348,10 +354,10 @@ class Scene(Message, version=1):
 
 
 class WorldState(Message, version=1, message="world_model"):
-    """Bodies as the world model knows them."""
+    """Poses of bodies in the world model."""
 
     revision: int = integer(
-        "rises when a body starts to move and when it rests again; 0: nothing sensed"
+        "rises when a body starts to move and when it rests again (0: nothing sensed)"
     )
     position: ndarray = field(unit="m", doc="body origins", shape=("bodies", 3))
     quaternion: ndarray = field(unit="1", doc="body orientations", shape=("bodies", 4))

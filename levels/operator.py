@@ -1,10 +1,10 @@
-"""An operator's commands to any level: operations, messages, and how a level follows them.
+"""Operator's commands to any level: operations, messages, and their handling by a level.
 
 An operator may command every level that reads "own.operator" and declares `commands`, in addition
-to the level above it or in its place. The level follows with `Orders`; its status derives from
-`AnsweringStatus`, its command from `RelayedCommand`. `operator` is passed down with every command,
-so the lowest status shows on which command its torque is based: the system's response can be
-measured.
+to the level above it or instead of it. The level handles the commands with `Orders`. Its status
+derives from `AnsweringStatus`, its command from `RelayedCommand`. The field `operator` is passed
+down with every command, so that the lowest status shows on which operator's command its torque is
+based. This makes the system's response measurable.
 """
 
 from __future__ import annotations
@@ -22,9 +22,12 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 MAX_JOINTS = 16
-"""Most joints of an arm: an operator's mailbox is the same in every rack."""
+"""Maximum number of joints of an arm.
+
+It is fixed, because an operator's mailbox has the same layout in every rack.
+"""
 NAME_BYTES = 64
-"""Longest name that a command can give."""
+"""Maximum length of a name in a command, bytes."""
 
 
 class Operation(IntEnum):
@@ -32,18 +35,17 @@ class Operation(IntEnum):
 
     NONE = 0
     HOLD = 1  # come to rest, and stay until RESUME
-    RESUME = 2  # return to the level's own work
-    SETPOINT = 3  # bring the joints to positions, and stay until RESUME
-    GOTO = 4  # move to a goal by the level's own planning, and stay until RESUME
-    MODIFY = 5  # put the control modification `name` in, or take it out
-    TABLE = 6  # decide by the state table `name` from now on
-    # do the level's own command `name` in place of those of the level above, and stay until RESUME
-    DO = 7
-    ENABLE = 8  # ask the arm's drives for torque
-    DISABLE = 9  # brake the arm, and take the torque from its drives
-    RESET = 10  # let the arm's drives leave their fault
-    RELEASE = 11  # end the bring-up: full speed from now on
-    SET = 12  # set a live parameter of the level, `name` being key=value
+    RESUME = 2  # return to normal work
+    SETPOINT = 3  # move the joints to positions, and stay until RESUME
+    GOTO = 4  # plan and make a motion to a goal, and stay until RESUME
+    MODIFY = 5  # switch the control modification `name` on or off
+    TABLE = 6  # use the state table `name` from now on
+    DO = 7  # execute the level's command `name` instead of the level above's, until RESUME
+    ENABLE = 8  # enable the arm's drives
+    DISABLE = 9  # brake the arm, and disable its drives
+    RESET = 10  # reset the fault of the arm's drives
+    RELEASE = 11  # end the bring-up and permit full speed
+    SET = 12  # set a live parameter of the level; `name` is key=value
 
 
 class Goal(IntEnum):
@@ -53,25 +55,27 @@ class Goal(IntEnum):
     JOINTS = 1  # joint positions
     POSE = 2  # position and orientation of the tool
     DIRECTION = 3  # position of the tool and direction of its z axis, any turn about it
-    HOME = 4  # where the arm starts
+    HOME = 4  # home position of the arm
     ON = 5
     OFF = 6
 
 
 SETTINGS = (Operation.MODIFY, Operation.TABLE, Operation.SET)
-"""Operations that are done at once and leave the command in force as it is; each names what it
-sets."""
+"""Operations that are done at once and do not replace the command in force.
+
+Each gives the name of what it sets.
+"""
 DRIVES = (Operation.ENABLE, Operation.DISABLE, Operation.RESET, Operation.RELEASE)
-"""Operations on the arm itself, which leave the command in force as it is, too."""
+"""Operations on the arm itself, which do not replace the command in force either."""
 NAMED = (*SETTINGS, Operation.DO)
-"""Operations that give a name: see `Executor.wording`."""
+"""Operations that give a name: see `Executor.list_operation_names`."""
 
 
 class Answer(IntEnum):
     """A level's answer to its operator's newest command."""
 
     NONE = 0  # there was none
-    TAKEN = 1  # the level is doing it
+    TAKEN = 1  # being executed
     DONE = 2
     REFUSED = 3  # the level continues as before
 
@@ -89,36 +93,38 @@ class OperatorCommand(Command, version=2):
     name: str = field(f"S{NAME_BYTES}", doc="what a setting sets, or the level's own command to do")
 
 
-RESTS_ON = integer("newest command of an operator, here or above, that this rests on; 0: none")
+RESTS_ON = integer(
+    "newest operator's command, at this level or above, on which this is based (0: none)"
+)
 
 
 class RelayedCommand(Command):
-    """Base of commands that pass on which operator's command they rest on."""
+    """Base class for commands that relay the operator's command on which they are based."""
 
     operator: int = RESTS_ON
 
 
 class SampledCommand(RelayedCommand):
-    """Base of commands that say on which sample of the arm, or hand, they rest."""
+    """Base class for commands that state the sample of arm or hand on which they are based."""
 
-    sampled: int = field(unit="tick", doc="tick of the status that it rests on; -1: none yet")
+    sampled: int = field(unit="tick", doc="tick of the status on which it is based (-1: none yet)")
 
 
 class AnsweringStatus(Status):
-    """Base of statuses that answer an operator."""
+    """Base class for statuses that answer an operator."""
 
     operator: int = RESTS_ON
-    order: int = integer("command of an operator that this answers, new or not; 0: none yet")
+    order: int = integer("operator's command that this answers, new or not (0: none yet)")
     answer: Answer = field(doc="this level's answer to it")
     standing: Operation = field(
-        doc="operator's command in force; 0: none, the level does its own work"
+        doc="operator's operation in force (0: none, the level does its normal work)"
     )
     objection: str = field(f"S{REASON_BYTES}", doc="why it was refused, readable")
 
 
 Commands = Mapping[Operation, Sequence[Goal]]
 HOLDABLE: Commands = {Operation.HOLD: (), Operation.RESUME: ()}
-"""The commands of a level that an operator can only hold."""
+"""The commands of a level that an operator can only hold and resume."""
 
 EFFECTS = {
     Operation.HOLD: "held",
@@ -126,27 +132,31 @@ EFFECTS = {
     Operation.GOTO: "diverted",
     Operation.DO: "commanded",
 }
-"""Effects of a standing command on a level, in words."""
+"""Effect of a standing command on a level, as text."""
 HELD_FROM_ABOVE = "held by the level above"
-"""Reason of a level that is held from above; the level above does not pass it on."""
+"""Reason of a level that is held by the level above.
+
+The level above does not pass this reason on.
+"""
 ABOVE_LOST = "no command from the level above: held until its board is back"
 BELOW_LOST = "no status from the level below: waiting for its board"
 
 
 def listed(commands: Commands) -> str:
-    """Return a level's commands as text: "hold, resume, goto joints|pose"."""
+    """Return the commands of a level as text, such as "hold, resume, goto joints|pose"."""
     return ", ".join(
-        f"{what.name.lower()} {goal_names(goals)}".rstrip() for what, goals in commands.items()
+        f"{operation.name.lower()} {goal_names(goals)}".rstrip()
+        for operation, goals in commands.items()
     )
 
 
 def goal_names(goals: Sequence[Goal]) -> str:
-    """Return goals as one word: "joints|pose"."""
+    """Return goals as one word, such as "joints|pose"."""
     return "|".join(goal.name.lower() for goal in goals)
 
 
 def described(what: int, goal: int) -> str:
-    """Return a command, valid or not, as text: "goto pose"."""
+    """Return a command, valid or not, as text, such as "goto pose"."""
     names = [
         kind(number).name.lower() if number in set(kind) else str(number)
         for kind, number in ((Operation, what), (Goal, goal))
@@ -163,44 +173,43 @@ class _Told(NamedTuple):
 
 
 class Orders:
-    """The operator's commands to one level.
+    """Operator's commands to one level.
 
-    A refused command leaves the one before it in force, even on a restarted board, which processes
-    all commands again, in order. Operators may overlap: a setting, or a refused command, takes
-    nothing from the answer to the command in force, which comes later. A status shows one answer;
-    several of a cycle are shown in the cycles that follow, oldest first.
+    A refused command leaves the command before it in force, even on a restarted board, which
+    processes all commands again in order. Operators may overlap: the command in force is still
+    answered later if a setting or a refused command arrives before it is done. A status shows one
+    answer at a time. Several answers of one cycle are shown in the following cycles, oldest first.
     """
 
     def __init__(self, commands: Commands) -> None:
         self._commands = commands
-        self.standing = (
-            Operation.NONE
-        )  # in force: one of `EFFECTS`; NONE: the level does its own work
-        self.serial = 0  # of the newest command; 0: none yet
-        self.basis = 0  # of the newest command that was not refused; 0: none yet
-        self._in_force = _Told(0, Answer.NONE)  # the newest that was neither refused nor a setting
+        # Operation in force, one of `EFFECTS`. NONE while the level does its normal work.
+        self.standing = Operation.NONE
+        self.serial = 0  # newest command. 0 if none yet
+        self.basis = 0  # newest command that was not refused. 0 if none yet
+        self._in_force = _Told(0, Answer.NONE)  # newest one neither refused nor a setting
         self._before = self.basis, self.standing, self._in_force
         self._news: list[_Told] = []  # answers that no status has shown
         self._shown = self._in_force
 
     @property
     def in_force(self) -> int:
-        """Serial of the newest command that was neither refused nor a setting; 0: none yet."""
+        """Serial of the newest command that was neither refused nor a setting. 0 if none yet."""
         return self._in_force.serial
 
     @property
     def answer(self) -> Answer:
-        """The answer to that command."""
+        """Answer to the command in force."""
         return self._in_force.answer
 
     @property
     def stands(self) -> bool:
-        """Whether a command keeps the level from its own work."""
+        """True if a command keeps the level from its normal work."""
         return self.standing is not Operation.NONE
 
     @property
     def holds(self) -> bool:
-        """Whether that is HOLD."""
+        """True if the operation in force is HOLD."""
         return self.standing is Operation.HOLD
 
     def take(
@@ -208,10 +217,16 @@ class Orders:
         operator: Reading[OperatorCommand],
         judge: Callable[[OperatorCommand], None] | None = None,
     ) -> bool:
-        """Read the mailbox; return True in the cycle that accepts a command other than a setting.
+        """Process the new commands of the operator's mailbox.
 
-        `judge` is called with each command accepted: there a level may refuse it for its own
-        reasons, and makes a setting.
+        Args:
+            operator: Reading of the mailbox.
+            judge: Called with each accepted command. The level may refuse it there for reasons of
+                the level, and applies a setting there. None if the level has nothing to check or
+                set.
+
+        Returns:
+            True in the cycle that accepts a command other than a setting.
         """
         if not operator.is_new:
             return False
@@ -223,55 +238,58 @@ class Orders:
                 if judge is not None:
                     judge(message)
             if self.in_force != replaced:
-                self._news = [told for told in self._news if told.serial != replaced]
+                self._news = [answer for answer in self._news if answer.serial != replaced]
         return taken
 
     def _take_up(self, message: OperatorCommand) -> bool:
-        # Once only: a clock board restarted while giving a command gives it again.
+        """Accept or refuse a new command; return True if it is accepted."""
+        # A clock board that is restarted while it gives a command gives it again.
         if message.id <= self.serial:
             return False
         self._before = self.basis, self.standing, self._in_force
         self.serial = message.id
-        what = message.what
+        operation = message.what
         goal = message.goal
-        if what not in self._commands or goal not in (
-            self._commands[Operation(what)] or (Goal.NONE,)
+        if operation not in self._commands or goal not in (
+            self._commands[Operation(operation)] or (Goal.NONE,)
         ):
             self.refuse(
-                f"{described(what, goal)} is not a command of this level; permitted:"
+                f"{described(operation, goal)} is not a command of this level; permitted:"
                 f" {listed(self._commands)}"
             )
             return False
         self.basis = self.serial
-        is_done = what in (Operation.RESUME, Operation.RELEASE, *SETTINGS)
-        told = _Told(self.serial, Answer.DONE if is_done else Answer.TAKEN)
-        if what not in (*SETTINGS, *DRIVES):
-            self.standing = Operation.NONE if what == Operation.RESUME else Operation(what)
-            self._in_force = told
-        self._tell(told)
+        is_done = operation in (Operation.RESUME, Operation.RELEASE, *SETTINGS)
+        answer = _Told(self.serial, Answer.DONE if is_done else Answer.TAKEN)
+        if operation not in (*SETTINGS, *DRIVES):
+            self.standing = (
+                Operation.NONE if operation == Operation.RESUME else Operation(operation)
+            )
+            self._in_force = answer
+        self._tell(answer)
         return True
 
     def refuse(self, why: str) -> None:
-        """Refuse the command just accepted: the one before it is in force again."""
+        """Refuse the command just accepted. The command before it is in force again."""
         self.basis, self.standing, self._in_force = self._before
         self._tell(_Told(self.serial, Answer.REFUSED, why))
 
     def fail(self, why: str) -> None:
-        """Abandon the command in force: the level holds instead."""
+        """Abandon the command in force. The level holds instead."""
         self.standing = Operation.HOLD
         self._answer(Answer.REFUSED, why)
 
     def under_way(self) -> None:
-        """Report that a RESUME takes time."""
+        """Report that a RESUME is not completed yet."""
         self._answer(Answer.TAKEN)
 
     def done(self) -> None:
-        """Report that the command in force is done; it remains in force."""
+        """Report that the command in force is done. It remains in force."""
         if self.answer is Answer.TAKEN:
             self._answer(Answer.DONE)
 
     def takes_time(self) -> None:
-        """Report that the setting just accepted is not done yet; `drives_done` reports that."""
+        """Report that the setting just accepted is not done yet; `report_drives_done` follows."""
         self._tell(_Told(self.serial, Answer.TAKEN))
 
     def drives_done(self, serial: int) -> None:
@@ -279,32 +297,34 @@ class Orders:
         self._tell(_Told(serial, Answer.DONE))
 
     def keeps(self, board: str) -> str:
-        """Return why an operator keeps level `board` from its own work; empty: none does."""
+        """Return why an operator keeps level `board` from its normal work. Empty if none does."""
         if self.answer is Answer.REFUSED:
             return f"{board} held, `resume` releases it: {self._in_force.objection}"
         effect = EFFECTS.get(self.standing)
         return f"{board} {effect} by the operator: `resume` releases it" if effect else ""
 
     def _answer(self, answer: Answer, why: str = "") -> None:
+        """Change the answer to the command in force."""
         self._in_force = _Told(self.in_force, answer, why)
         self._tell(self._in_force)
 
-    def _tell(self, told: _Told) -> None:
-        """Show an answer in the status, in place of an older one to the same command."""
+    def _tell(self, answer: _Told) -> None:
+        """Queue an answer for the status. It replaces an older answer to the same command."""
         for at, waiting in enumerate(self._news):
-            if waiting.serial == told.serial:
-                self._news[at] = told
+            if waiting.serial == answer.serial:
+                self._news[at] = answer
                 return
-        self._news.append(told)
+        self._news.append(answer)
 
     def rests_on(self, above: int) -> int:
-        """Return the newest command that this cycle rests on; `above` is that of the command from
-        above.
+        """Return the newest operator's command on which this cycle is based.
+
+        `above` is the command on which the command from the level above is based.
         """
         return max(self.basis, above)
 
     def report(self, status: AnsweringStatus, above: int = 0) -> None:
-        """Fill the fields of `AnsweringStatus`."""
+        """Fill the fields of `AnsweringStatus`. For `above` see `find_basis`."""
         if self._news:
             self._shown = self._news.pop(0)
         status.operator = self.rests_on(above)
@@ -315,26 +335,32 @@ class Orders:
 
 
 def answered(status: AnsweringStatus | AnyMessage) -> int:
-    """Return the newest command that a level had taken up by this status of it, so that a restarted
-    board does not do it twice.
+    """Return the newest command that a level had accepted when it wrote this status.
+
+    A restarted board uses it so that it does not execute a command twice.
     """
-    # The answer shown may be a late one, to a command before the newest.
+    # The status may show a late answer to an earlier command.
     return max(status.order, status.operator)
 
 
 def joints_of(
     message: OperatorCommand, names: Sequence[str], ranges: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the joint positions, (joints,), rad, of an `OperatorCommand`; `ranges` (joints, 2)
-    are permitted.
+    """Return the joint positions of an `OperatorCommand`, (joints,), rad.
 
-    Raises `ValueError` with the joint, its value and the range.
+    Args:
+        message: The command.
+        names: Names of the joints.
+        ranges: Permitted positions, (joints, 2), rad.
+
+    Raises:
+        ValueError: The number of joints is wrong, or a position is outside its range.
     """
     if message.count != len(names):
         raise ValueError(f"{message.count} joint positions; the arm has {len(names)} joints")
     joints = np.array(message.joints[: message.count])
     for name, value, (low, high) in zip(names, joints, ranges, strict=True):
-        # Written so that NaN is outside.
+        # The condition is negated so that NaN counts as outside.
         if not low <= value <= high:
             raise ValueError(f"joint '{name}' at {value:g} rad; permitted: {low:g} to {high:g}")
     return joints

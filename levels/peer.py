@@ -1,8 +1,8 @@
-"""What a rack knows of another one on the network: the mailbox `lan.peer_<rack>` of its adapter,
-for levels to read.
+"""State of another rack on the network, for levels to read.
 
 A level that works together with another rack reads it with `Input(PeerPresence,
-"lan.peer_<rack>")`: whether that rack is there, and how its simulated time lies next to ours.
+"lan.peer_<rack>")`, a mailbox of the network adapter. It shows whether that rack is present, and
+the offset between its simulated time and ours.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from enum import IntEnum
 from rack.backplane.message import Message, field, integer
 
 DRIFT_PPM = 100
-"""Largest difference between the rates of two clocks: each crystal within 50 ppm."""
+"""Maximum difference between the rates of two clocks, since each crystal is within 50 ppm."""
 
 
 class Presence(IntEnum):
-    """Where another rack is."""
+    """Whether another rack is present."""
 
     AWAITED = 0  # not seen yet
     THERE = 1
@@ -24,33 +24,30 @@ class Presence(IntEnum):
 
 
 class PeerPresence(Message, version=1, message="peer"):
-    """Where another rack is, and its clock; written by the network adapter."""
+    """Presence and clock of another rack, written by the network adapter."""
 
-    presence: Presence = field(doc="awaited, there or lost")
+    presence: Presence = field(doc="awaited, present or lost")
     launch: int = field(
-        unit="1", doc="number of the launch that is there, or was last; 0: none, or in lockstep"
+        unit="1", doc="number of the present or last launch (0: none, or in lockstep)"
     )
     launches: int = integer("its launches seen so far: a number above 1 means restarts")
     losses: int = integer("how often it was lost")
-    since: int = field(unit="tick", doc="since when it is there, or lost")
-    offset: float = field(
-        unit="s", doc="its CLOCK_MONOTONIC less that of this machine; 0 in lockstep"
-    )
+    since: int = field(unit="tick", doc="tick since which it is present or lost")
+    offset: float = field(unit="s", doc="its CLOCK_MONOTONIC minus ours; 0 in lockstep")
     uncertainty: float = field(
-        unit="s", doc="largest error of the offset; -1: not measured yet; 0 in lockstep"
+        unit="s", doc="largest error of the offset; -1 if not measured yet, 0 in lockstep"
     )
     round_trip: float = field(
-        unit="s", doc="shortest recent round trip; -1: not measured yet; 0 in lockstep"
+        unit="s", doc="shortest recent round trip; -1 if not measured yet, 0 in lockstep"
     )
-    steps: int = integer(
-        "how often its clock or ours was found to have stepped, as when a machine sleeps"
-    )
-    ahead: float = field(
-        unit="s", doc="its simulated time less that of this rack, at the same instant"
-    )
-    speed: float = field(unit="1", doc="its simulated seconds in a real one")
+    steps: int = integer("number of detected steps of its clock or ours, as when a machine sleeps")
+    ahead: float = field(unit="s", doc="its simulated time minus ours, at the same instant")
+    speed: float = field(unit="1", doc="its simulated seconds per real second")
 
 
 def peer_port(rack: str) -> str:
-    """Return the adapter's port for a rack: names of mailboxes have no hyphens."""
+    """Return the name of the adapter's port for a rack.
+
+    Hyphens become underscores, because names of mailboxes must not contain hyphens.
+    """
     return f"peer_{rack.replace('-', '_')}"

@@ -10,8 +10,8 @@ class PowerMeter(Executor):
         self.status.power = float((servo.torque * servo.velocity).sum())
 ```
 
-The class attribute is the declaration. In an object the attribute is what the board puts there in
-every cycle: a `Reading` of an input, the message of an output.
+The class attribute is the declaration. In an object, the board sets the attribute in every cycle:
+to a `Reading` for an input, to the message for an output.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ M = TypeVar("M", bound=Message)
 
 
 class Port(Generic[M]):
-    """A port of a level, by its name in the class."""
+    """A port of a level, named after its attribute in the class."""
 
     message: type[M]
     name = ""
@@ -38,7 +38,7 @@ class Port(Generic[M]):
         self.name = name
 
     def not_connected(self) -> LevelError:
-        """Return the error of an object that uses the port before a board has connected it."""
+        """Return the error for using the port before a board has connected it."""
         return LevelError(f"port '{self.name}': no board has connected it to a mailbox")
 
 
@@ -46,9 +46,9 @@ class InputPort(Port[M]):
     """A port that a level reads.
 
     Attributes:
-        source: The mailbox, or mailboxes, as of `Input`.
-        many: Whether it reads the mailbox of every neighbour.
-        optional: Whether the level also works without any.
+        source: The mailbox or mailboxes, see `Input`.
+        many: True if it reads the mailbox of every neighbour.
+        optional: True if the level also works without any.
     """
 
     many = False
@@ -60,12 +60,12 @@ class InputPort(Port[M]):
 
 
 class Input(InputPort[M]):
-    """A port that a level reads: an attribute that is a `Reading` of a message class.
+    """A port that a level reads; the attribute is a `Reading` of a message class.
 
     Args:
         message: The class of its messages.
-        source: A mailbox ("world.model"), or relative to the level: "above.command",
-            "below.status", "own.plan". A config may wire the port elsewhere.
+        source: A mailbox ("world.model"), or a place relative to the level: "above.command",
+            "below.status", "own.plan". A config may connect another mailbox.
     """
 
     @overload
@@ -73,7 +73,7 @@ class Input(InputPort[M]):
     @overload
     def __get__(self, level: Any, owner: type) -> Reading[M]: ...
     def __get__(self, level: Any, owner: type) -> Self | Reading[M]:
-        """Return the declaration or, of a level that no board has connected, an empty reading."""
+        """Return the declaration, or an empty reading if no board has connected the level."""
         if level is None:
             return self
         empty = Reading(self.message.zeros(level.context.sizes), Verdict.NONE)
@@ -81,14 +81,15 @@ class Input(InputPort[M]):
 
 
 class Inputs(InputPort[M]):
-    """A port that reads the mailbox of every neighbour: an attribute that maps boards to readings.
+    """A port that reads the mailbox of every neighbour; the attribute maps boards to readings.
 
-    In the config's order. By mailbox where the config names several of one board.
+    The boards are in the order of the config. If the config names several mailboxes of one board,
+    the keys are mailboxes.
 
     Args:
         message: The class of all messages.
-        source: As of `Input`.
-        optional: The level also works without any such neighbour.
+        source: As in `Input`.
+        optional: True if the level also works without any such neighbour.
     """
 
     many = True
@@ -102,23 +103,24 @@ class Inputs(InputPort[M]):
     @overload
     def __get__(self, level: Any, owner: type) -> Mapping[str, Reading[M]]: ...
     def __get__(self, level: Any, owner: type) -> Self | Mapping[str, Reading[M]]:
-        """Return the declaration or, of a level that no board has connected, no readings."""
+        """Return the declaration, or no readings if no board has connected the level."""
         return self if level is None else vars(level).setdefault(self.name, {})
 
 
 class Output(Port[M]):
-    """A port that a level writes: an attribute that is a message, written at the end of each cycle.
+    """A port that a level writes; the attribute is a message, written at the end of each cycle.
 
     Fields keep their values from cycle to cycle.
 
     Args:
         message: The class of its messages.
-        cycles: Written in every n-th cycle: the last one before a multiple of n cycles' ticks,
-            counted from the board's phase, so that readers released then find it fresh. If that
-            cycle is missed, the message is missing too.
-        rests_on: The input whose information it passes on. Its messages carry the tick of that
-            information, the oldest one of an `Inputs`. By default they carry the tick of their own
-            release. The response of the whole hierarchy is measured by these ticks.
+        cycles: The message is written in every n-th cycle: the last one before a multiple of n
+            cycles' ticks, counted from the board's phase, so that readers released then find it
+            fresh. If that cycle is missed, the message is missing too.
+        rests_on: The input whose information the port passes on. Its messages carry the tick of
+            that information, or of the oldest information of an `Inputs`. By default they carry the
+            tick of the cycle's release. The response of the whole hierarchy is measured by these
+            ticks.
     """
 
     queued = False
@@ -140,30 +142,35 @@ class Output(Port[M]):
     @overload
     def __get__(self, level: Any, owner: type) -> M: ...
     def __get__(self, level: Any, owner: type) -> Self | M:
-        """Return the declaration or, of a level that no board has connected, a message."""
+        """Return the declaration, or an empty message if no board has connected the level."""
         if level is None:
             return self
         message = self.message.zeros(level.context.sizes)
         return vars(level).setdefault(self.name, message)  # type: ignore[no-any-return]
 
     def is_due(self, tick: int, every: int, phase: int) -> bool:
-        """Return whether the cycle released at `tick`, every `every` ticks from tick `phase`,
-        writes it.
+        """Return True if a cycle writes the port.
+
+        Args:
+            tick: Release of the cycle.
+            every: Ticks from cycle to cycle.
+            phase: First tick of the level.
         """
         return (tick - phase + every) % (self.cycles * every) == 0
 
 
 class Sender(Generic[M]):
-    """A message and the way to send it, of a port that is not simply written in every cycle.
+    """A message and the function to send it, for a port that is not written in every cycle.
 
     Attributes:
-        message: What is sent; the level fills it.
-        send: Sends a copy of it; False: the queue is full, and the message was not taken. Takes the
-            tick of the information on which the message rests, if that is not the port's own.
-        room: Returns how many messages may still be sent in this cycle.
+        message: The message to fill.
+        send: Sends a copy of the message. Returns False if the queue is full, and the message was
+            not sent. Takes as optional argument the tick of the information on which the message is
+            based.
+        room: Returns how many more messages can be sent in this cycle.
     """
 
-    # A field that is set here in place of in the message is an error.
+    # Slots make it an error to set a field here instead of in the message.
     __slots__ = ("message", "room", "send")
 
     def __init__(self, message: M, send: Callable[..., bool], room: Callable[[], int]) -> None:
@@ -173,32 +180,32 @@ class Sender(Generic[M]):
 
 
 class SentOutput(Output[M]):
-    """A port whose messages the level sends itself: an attribute that is a `Sender`."""
+    """A port whose messages the level sends explicitly; the attribute is a `Sender`."""
 
     @overload  # type: ignore[override]
     def __get__(self, level: None, owner: type) -> Self: ...
     @overload
     def __get__(self, level: Any, owner: type) -> Sender[M]: ...
     def __get__(self, level: Any, owner: type) -> Self | Sender[M]:
-        """Return the declaration; a level that no board has connected can send nothing."""
+        """Return the declaration. Raises `LevelError` if no board has connected the level."""
         if level is None:
             return self
         raise self.not_connected()
 
 
 class QueuedOutput(SentOutput[M]):
-    """A port whose messages go through a queue, any number in a cycle: none is missed."""
+    """A port whose messages go through a queue, any number in a cycle, so that none is missed."""
 
     queued = True
 
 
 class TimedOutput(SentOutput[M]):
-    """A port that is written only in cycles in which the level sends its message.
+    """A port that is written only in the cycles in which the level sends its message.
 
     Args:
         message: The class of its messages.
-        max_age_s: Age of the information from which readers find its writer lost, s of simulated
-            time; in between they find the message old.
+        max_age_s: Age of the information from which readers consider the writer lost, s of
+            simulated time. Until then they read the message as old.
     """
 
     def __init__(self, message: type[M], max_age_s: float) -> None:
@@ -207,8 +214,9 @@ class TimedOutput(SentOutput[M]):
 
 
 class MadePorts(NamedTuple):
-    """Ports that a config makes, in addition to those that a class declares; not `is_whole` if some
-    are unknown.
+    """Ports that a config creates, in addition to the ports that a class declares.
+
+    `is_whole` is False if some are unknown.
     """
 
     inputs: Mapping[str, InputPort[Any]] = MappingProxyType({})
@@ -217,14 +225,16 @@ class MadePorts(NamedTuple):
 
 
 class FindingKind:
-    """What a level may find and report, declared as an attribute of its class: an event of a run.
+    """A kind of finding that a level may raise, declared as an attribute of its class.
+
+    Each episode of a finding is an event of the run.
 
     ```python
     contact = FindingKind(unit="N m", doc="the arm touches something")
     ```
 
     Args:
-        unit: Unit of the value measured; "1" for a plain number.
+        unit: Unit of the measured value. "1" for a plain number.
         doc: Meaning, in a few words.
     """
 
@@ -239,7 +249,7 @@ class FindingKind:
 
     @property
     def mistake(self) -> str:
-        """What is wrong with the declaration; empty: nothing."""
+        """Description of the mistake in the declaration. Empty if it is valid."""
         if not self.unit or not self.doc:
             return 'needs a unit ("1": a plain number) and a meaning, doc="..."'
         if self.name.upper() in RESERVED:
@@ -248,17 +258,17 @@ class FindingKind:
 
 
 RESERVED = frozenset((*Alarm.__members__, "BEGINS", "ENDS", "DIED", "RESTART"))
-"""Names that no finding may have: those of alarms, and of what befalls boards and faults."""
+"""Names that no finding may have: alarms, and events of boards and faults."""
 
 
 def collect_ports(level: type, attribute: str, kinds: tuple[type, ...]) -> dict[str, Any]:
-    """Return the ports, or findings, of a class: those of its bases, then its own.
+    """Return the ports, or findings, of a class: first inherited ones, then the class's own.
 
-    A class drops one of a base by setting it to None.
+    A class drops an inherited one by setting it to None.
 
     Args:
         level: The class.
-        attribute: The attribute in which the bases have theirs, by name.
+        attribute: Name of the attribute in which the base classes keep theirs.
         kinds: Classes to collect.
 
     Raises:
@@ -266,24 +276,30 @@ def collect_ports(level: type, attribute: str, kinds: tuple[type, ...]) -> dict[
             in a dict, as before version 0.3.
     """
     if attribute in vars(level):
-        why = f"'{attribute}' is not a dict any more: each port is an attribute of the class"
-        raise LevelError(f"class {level.__name__}: {why}, as in status = Output(MyStatus)")
+        raise LevelError(
+            f"class {level.__name__}: '{attribute}' is no longer a dict: each port is an attribute"
+            " of the class, as in status = Output(MyStatus)"
+        )
     noun = "finding" if FindingKind in kinds else "port"
     known: dict[str, Any] = {}
     for base in reversed(level.__mro__[1:]):
         known |= {port.name: port for port in vars(base).get(attribute, {}).values()}
-    found = dict(known)
+    ports = dict(known)
     for name, value in vars(level).items():
         if isinstance(value, kinds):
             if name not in known and any(hasattr(base, name) for base in level.__bases__):
-                why = f"{noun} '{name}' has the name of another attribute"
-                raise LevelError(f"class {level.__name__}: {why}; rename the {noun}")
-            # A port declared again takes its place among the class's own.
-            found.pop(name, None)
-            found[name] = value
+                raise LevelError(
+                    f"class {level.__name__}: {noun} '{name}' has the name of another attribute;"
+                    f" rename the {noun}"
+                )
+            # A port that is declared again moves to the class's own ports.
+            ports.pop(name, None)
+            ports[name] = value
         elif name in known and value is None:
-            del found[name]
+            del ports[name]
         elif name in known:
-            why = f"attribute '{name}' has the name of a {noun}"
-            raise LevelError(f"class {level.__name__}: {why}; rename the attribute")
-    return found
+            raise LevelError(
+                f"class {level.__name__}: attribute '{name}' has the name of a {noun}; rename the"
+                " attribute"
+            )
+    return ports

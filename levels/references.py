@@ -1,6 +1,4 @@
-"""What a config names as "package.module:Name", imported; also by the names that earlier versions
-had for it.
-"""
+"""Import of what a config names as "package.module:Name", including names of earlier versions."""
 
 from __future__ import annotations
 
@@ -18,11 +16,11 @@ from rack.backplane.process import die_with_parent, how_ended, readable
 
 T = TypeVar("T")
 SLOW_S = 2.0
+"""Duration of an import after which the user is told that it continues, s."""
 IMPORT_S = 60.0
-"""Time after which a user hears that a module is still being imported, and after which it is
-refused."""
+"""Duration of an import after which the module is refused, s."""
 IMPORTED = 117
-"""Exit status of a child that has come to the end of an import: few modules end with it."""
+"""Exit status of a child that has completed an import. Few modules exit with it themselves."""
 
 MOVED = {
     "rack.boards.adapters": "rack.boards.host",
@@ -42,24 +40,34 @@ MOVED = {
     "rack.levels.systems.cell": "rack.levels.systems.coordination",
     "rack.levels.trajectory": "rack.levels.systems.trajectory",
 }
-"""Packages, modules and classes that have moved: the configs of users and of saved runs name their
-old places."""
+"""Packages, modules and classes that have moved, with their new places.
+
+Configs of users and of recorded runs name the old places.
+"""
 
 
 def current(reference: str) -> str:
     """Return the present name of "package.module:Name"."""
     for old, new in MOVED.items():
-        rest = reference.removeprefix(old)
-        if rest != reference and rest[:1] in ("", ".", ":"):
-            return new + rest
+        remainder = reference.removeprefix(old)
+        if remainder != reference and remainder[:1] in ("", ".", ":"):
+            return new + remainder
     return reference
 
 
 def module_and_name(reference: str, is_tried: bool = True) -> tuple[ModuleType, str]:
-    """Return the module that "package.module:Name" names, imported, and the name in it. Raises
-    `LookupError`.
+    """Import the module that "package.module:Name" names.
 
-    With `is_tried` no module of a user's can end this process, or hold it for ever.
+    Args:
+        reference: The reference.
+        is_tried: Whether to import the module in a child process first, so that a user's module
+            cannot end or block this process.
+
+    Returns:
+        The module, and the name in it.
+
+    Raises:
+        LookupError: The module cannot be imported.
     """
     module, _, name = current(reference).partition(":")
     is_new = module not in sys.modules and not module.startswith("rack.")
@@ -67,50 +75,56 @@ def module_and_name(reference: str, is_tried: bool = True) -> tuple[ModuleType, 
         if is_tried and is_new and (reason := _trial(module)):
             raise ImportError(reason)
         return importlib.import_module(module), name
-    except (
-        Exception,
-        SystemExit,
-    ) as error:  # a user's module may raise anything while it is imported
+    # A user's module may raise anything while it is imported.
+    except (Exception, SystemExit) as error:
         raise LookupError(f"cannot import '{module}': {type(error).__name__}: {error}") from error
 
 
 def find_class(reference: str, base: type[T], is_tried: bool = True) -> type[T]:
-    """Return the subclass of `base` that "package.module:Class" names. Raises `LookupError` with
-    the reason. `is_tried` is that of `module_and_name`.
+    """Return the subclass of `base` that "package.module:Class" names.
+
+    Args:
+        reference: The reference.
+        base: The required base class.
+        is_tried: As for `import_reference`.
+
+    Raises:
+        LookupError: The class is missing, abstract, or no subclass of `base`.
     """
     module, name = module_and_name(reference, is_tried)
-    found = getattr(module, name, None)
-    if not isinstance(found, type) or not issubclass(found, base):
+    named = getattr(module, name, None)
+    if not isinstance(named, type) or not issubclass(named, base):
         kinds = [
             n
             for n, c in inspect.getmembers(module, inspect.isclass)
             if issubclass(c, base) and c is not base
         ]
-        what = "has no class" if found is None else f"has no {base.__name__} named"
+        problem = "has no class" if named is None else f"has no {base.__name__} named"
         raise LookupError(
-            f"module '{module.__name__}' {what} '{name}'; it has: {', '.join(kinds) or 'none'}"
+            f"module '{module.__name__}' {problem} '{name}'; it has: {', '.join(kinds) or 'none'}"
         )
-    if inspect.isabstract(found):
-        missing = ", ".join(sorted(getattr(found, "__abstractmethods__", ())))
-        raise LookupError(f"class '{name}' lacks: {missing}")
-    return found
+    if inspect.isabstract(named):
+        missing = ", ".join(sorted(getattr(named, "__abstractmethods__", ())))
+        raise LookupError(f"class '{name}' does not implement: {missing}")
+    return named
 
 
 # A config is checked for many mistakes, and each may need the module.
 @cache
 def _trial(module: str) -> str:
-    """Import a module in a child; return why it must not be imported here, if so. What it raises is
-    no such reason.
+    """Import a module in a child process; return why it must not be imported in this process.
+
+    Empty if it may be imported. An exception that the module raises is no reason against it.
     """
     parent = os.getpid()
     try:
         child = os.fork()
     except OSError:
-        # The launch says which limit is reached.
+        # The launch reports which limit is reached.
         return ""
     if child == 0:
         try:
-            # Signals of the terminal are the parent's to answer.
+            # The parent alone responds to signals of the terminal.
             os.setsid()
             die_with_parent(parent)
             os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
@@ -122,7 +136,7 @@ def _trial(module: str) -> str:
     ended = os.pidfd_open(child)
     try:
         if not readable(ended, SLOW_S):
-            sys.stderr.write(f"importing '{module}', for at most {IMPORT_S:g} s\n")
+            sys.stderr.write(f"still importing '{module}'; it may take {IMPORT_S:g} s\n")
             sys.stderr.flush()
         is_over = readable(ended, IMPORT_S - SLOW_S)
     finally:
@@ -130,5 +144,5 @@ def _trial(module: str) -> str:
         status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
         os.close(ended)
     if not is_over:
-        return f"not done within {IMPORT_S:g} s"
+        return f"it did not finish within {IMPORT_S:g} s"
     return "" if status == IMPORTED else f"it ended the process: {how_ended(status)}"

@@ -1,7 +1,7 @@
 """Config tables that levels read: `[robot]`, `[scene]`, and the base of `[board.<name>.params]`.
 
-An arm is data: an MJCF file, and in `[robot]` the rest. `rack.levels.robot` builds the cell from
-both.
+An arm is data: an MJCF file describes it, and `[robot]` adds the rest. `rack.levels.robot` builds
+the cell from both.
 """
 
 from __future__ import annotations
@@ -34,34 +34,39 @@ from rack.levels.references import find_class
 
 T = TypeVar("T")
 
-# No quantity of an arm in SI units, and no time of a run, exceeds these: sums and squares of them
-# stay finite. pydantic keeps one bound of each kind, so a narrower field uses `le` and `ge`.
 MOST = 1e9
+"""Bound of all quantities of an arm in SI units, and of all times of a run.
+
+Sums and squares of such values stay finite. pydantic keeps one bound of each kind, so a field with
+narrower bounds uses `le` and `ge`."""
 MOST_JOINTS = 16
-"""Of an arm."""
+"""Maximum number of joints of an arm."""
 Positive = Annotated[float, Field(gt=0, lt=MOST, allow_inf_nan=False)]
 Finite = Annotated[float, Field(gt=-1e9, lt=1e9, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Vector = tuple[Finite, Finite, Finite]
 Interface = Literal["torque", "position", "velocity"]
-"""What drives take; with the last two they close loops of their own."""
+"""Commands that drives accept.
+
+Drives that accept positions or velocities close their control loops themselves.
+"""
 Moment = Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False)]
 """Simulated time, s."""
 LAST_TICK = 10**15
-"""Ticks are 64-bit words: this many of the shortest ones last 300 years."""
+"""Maximum tick. Ticks are 64-bit words; this many of the shortest ones last 300 years."""
 Tick = Annotated[int, Field(ge=0, le=LAST_TICK)]
 
 
 LIVE: JsonDict = {"live": True}
 Live = Annotated[T, Field(json_schema_extra=LIVE)]
-"""A field of params that an operator may set while the level runs: `gain: Live[Positive] = 2.0`."""
+"""Field of params that an operator may set while the level runs: `gain: Live[Positive] = 2.0`."""
 
 
 class Table(BaseModel):
-    """Base of every config table: unknown keys are errors, values are frozen, `true` does not pass
-    for 1.
+    """Base class of every config table.
 
-    A text below a field is its description: see `keys_of`.
+    Unknown keys are errors, values are frozen, and `true` is not accepted for 1. A text below a
+    field is its description: see `describe_keys`.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
@@ -69,19 +74,19 @@ class Table(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _with_tuples(cls, table: Any) -> Any:
-        """Turn TOML's lists into tuples, which are frozen."""
+        """Convert TOML's lists to tuples, which are frozen."""
         if not isinstance(table, dict):
             return table
-        # Dicts of the user's own keys stay as given.
+        # Dicts with keys that the user chooses are not changed.
         return {k: v if isinstance(v, dict) else frozen(v) for k, v in table.items()}
 
 
 def keys_of(kind: type[BaseModel]) -> dict[str, FieldInfo]:
     """Return the fields of a table by their keys, each with its description.
 
-    Where a field has none, that is the text below it. pydantic can look for such texts itself
-    (`use_attribute_docstrings`), but does so in every class that is made: each start of a rack
-    would take 0.2 s longer.
+    A field without a description takes the text below it. pydantic can look for such texts itself
+    (`use_attribute_docstrings`), but does so for every class when it is defined, so that each start
+    of a rack would take 0.2 s longer.
     """
     below = ChainMap(*(_texts_below(base) for base in kind.__mro__ if issubclass(base, Table)))
     for name, field in kind.model_fields.items():
@@ -92,19 +97,20 @@ def keys_of(kind: type[BaseModel]) -> dict[str, FieldInfo]:
 @cache
 def _texts_below(table: type[Table]) -> dict[str, str]:
     """Return the texts below the fields of a class in its source, by field."""
-    found = {}
-    with suppress(OSError, TypeError):  # a class typed at a prompt has no source
+    texts = {}
+    # A class typed at a prompt has no source.
+    with suppress(OSError, TypeError):
         (declared,) = ast.parse(dedent(inspect.getsource(table))).body
         assert isinstance(declared, ast.ClassDef)
         for pair in pairwise(declared.body):
             match pair:
                 case ast.AnnAssign(ast.Name(name)), ast.Expr(ast.Constant(str(text))):
-                    found[name] = " ".join(text.split())
-    return found
+                    texts[name] = " ".join(text.split())
+    return texts
 
 
 def frozen(value: Any) -> Any:
-    """Return a value of TOML with tuples in place of all lists in it, also of those in tables."""
+    """Return a TOML value with tuples instead of lists, also inside tables."""
     if isinstance(value, dict):
         return {key: frozen(item) for key, item in value.items()}
     return tuple(map(frozen, value)) if isinstance(value, list) else value
@@ -114,12 +120,16 @@ Params = TypeVar("Params", bound=Table)
 
 
 def read_params(kind: type[Params], params: Mapping[str, Any]) -> Params:
-    """Return `params` as `kind`. Raises `LevelError` with the key, its value and the valid keys."""
+    """Validate `params` and return them as a record of class `kind`.
+
+    Raises:
+        LevelError: A value is invalid. The text has the key, the value and the valid keys.
+    """
     try:
         return kind(**params)
     except ValidationError as error:
         first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"])
+        key = ".".join(str(key_part) for key_part in first["loc"])
         valid = ", ".join(kind.model_fields)
         raise LevelError(
             f"params.{key} = {first['input']!r}: {first['msg'].lower()}; keys: {valid}"
@@ -127,22 +137,32 @@ def read_params(kind: type[Params], params: Mapping[str, Any]) -> Params:
 
 
 def live_keys(kind: type[Table] | None) -> tuple[str, ...]:
-    """Return the params that may be set while their level runs."""
+    """Return the names of the params that may be set while the level runs."""
     fields = {} if kind is None else kind.model_fields
     return tuple(key for key, field in fields.items() if field.json_schema_extra == LIVE)
 
 
 def read_setting(setting: str) -> tuple[str, Any]:
-    """Return key and value of "key=value", with the value in TOML. Raises `LevelError`."""
+    """Return key and value of "key=value", with the value in TOML.
+
+    Raises:
+        LevelError: The text has another form.
+    """
     key, _, text = setting.partition("=")
     try:
         return key.strip(), load_toml(f"value = {text}")["value"]
-    except ValueError:  # the parser's own errors are such
+    # The errors of the TOML parser derive from `ValueError`.
+    except ValueError:
         raise LevelError("must be key=value, as in bandwidth=80") from None
 
 
 def set_live(params: Params, setting: str) -> tuple[Params, str]:
-    """Return `params` with a live one set anew by "key=value", and why not; empty: it is set."""
+    """Set a live parameter by "key=value".
+
+    Returns:
+        The new params, and why the parameter was not set, empty if it was. A refused setting leaves
+        the params unchanged.
+    """
     kind = type(params)
     try:
         key, value = read_setting(setting)
@@ -154,7 +174,11 @@ def set_live(params: Params, setting: str) -> tuple[Params, str]:
 
 
 def named_class(reference: str, base: type[T]) -> type[T]:
-    """Return the subclass of `base` that "package.module:Class" names. Raises `ValueError`."""
+    """Return the subclass of `base` that "package.module:Class" names.
+
+    Raises:
+        ValueError: It is missing or no such subclass.
+    """
     try:
         return find_class(reference, base)
     except LookupError as error:
@@ -162,10 +186,10 @@ def named_class(reference: str, base: type[T]) -> type[T]:
 
 
 class SensorConfig(Table):
-    """Resolution and noise of the joints' encoders: one value for all joints, or a list with one
-    per joint; 0: exact.
+    """Resolution and noise of the joint encoders.
 
-    Velocities have ten times as much of both, in rad/s; see `rack.levels.robot.limits.Encoders`.
+    One value for all joints, or a list with one per joint. 0 means exact. Velocities have ten times
+    as much of both, in rad/s; see `rack.levels.robot.limits.Encoders`.
     """
 
     resolution: NotNegative | tuple[NotNegative, ...] = 0.0
@@ -178,27 +202,31 @@ class CalibrationConfig(Table):
     """`[robot.calibration]`: how the drives' samples become positions of the joints."""
 
     offset: tuple[Finite, ...] | None = None
-    """added to every position that the drives give, rad; default: nothing"""
+    """added to every position that the drives report, rad; default: nothing"""
     homing: bool = False
-    """the drives find their reference while they are being enabled, and know no position before
-    that"""
+    """whether the drives search for their reference while they are being enabled, and know no
+    position before"""
 
 
 DAMPING_S = 0.03
-"""Damping of a gripper's loop per stiffness, where none is given."""
+"""Default damping of a gripper's loop, divided by its stiffness, s."""
 STILL_PARTS = 20
-"""The opening may be a length or an angle: what counts as no motion is a part of the whole."""
+"""Divisor of the gripper's travel that yields its threshold of motion.
+
+The opening may be a length or an angle, so the threshold is relative.
+"""
 
 
 class FollowConfig(Table):
-    """`[[robot.gripper.follow]]`: a joint that the gripper moves, though the model couples it to
-    nothing. Its own actuator is removed.
+    """`[[robot.gripper.follow]]`: a joint that moves with the gripper's driven joint.
+
+    For joints that the model does not couple. Their actuators are removed.
     """
 
     joint: str
     """MJCF joint that follows the driven one"""
     ratio: Finite = 1.0
-    """its motion per motion of the driven joint, from the model's reference pose"""
+    """motion of the joint per motion of the driven joint, from the model's reference pose"""
 
 
 class GripperConfig(Table):
@@ -211,19 +239,19 @@ class GripperConfig(Table):
     open: Finite
     """joint position when open, m or rad"""
     closed: Finite
-    """joint position when closed on nothing, m or rad"""
+    """joint position when closed without an object, m or rad"""
     force: Positive
     """largest force or torque of the actuator, N or N m"""
     stiffness: Positive | None = None
-    """position loop, N/m or N m/rad; default: all of the force at half of the way to closed"""
+    """of the position loop, N/m or N m/rad; default: full force at half of the travel"""
     damping: Positive | None = None
-    """position loop, N s/m or N m s/rad; default: 30 ms times the stiffness"""
+    """of the position loop, N s/m or N m s/rad; default: 30 ms times the stiffness"""
     follow: tuple[FollowConfig, ...] = ()
-    """joints that follow the driven one, where the model does not say so"""
+    """joints that follow the driven joint although the model does not couple them"""
     residual: Positive = 0.012
-    """how far fingers may settle from where planning poses them, because soft couplings yield, or a
-    loop may stay open, m; by default less than the 15 mm that planned motion keeps from
-    everything"""
+    """largest distance by which fingers may settle from their planned pose because soft couplings
+    yield, or by which a loop may stay open, m; the default is less than the 15 mm clearance of
+    planned motion"""
 
     @model_validator(mode="after")
     def _opens(self) -> GripperConfig:
@@ -233,7 +261,7 @@ class GripperConfig(Table):
 
     @property
     def travel(self) -> float:
-        """The way of the driven joint from open to closed, m or rad."""
+        """Distance of the driven joint from open to closed, m or rad."""
         return abs(self.open - self.closed)
 
     @property
@@ -244,14 +272,15 @@ class GripperConfig(Table):
 
     @property
     def still(self) -> float:
-        """Part of that way, m or rad, that counts as none; and in a second, as rest."""
+        """Motion of the driven joint that counts as none, m or rad.
+
+        The same in one second is the speed that counts as rest.
+        """
         return self.travel / STILL_PARTS
 
 
 class WristConfig(Table):
-    """`[robot.wrist]`: a force/torque sensor between arm and tool, and the arm's limits on
-    contact.
-    """
+    """`[robot.wrist]`: a force/torque sensor between arm and tool, and limits on contact."""
 
     force: str
     """MJCF force sensor; its cutoff is its range, N"""
@@ -273,12 +302,13 @@ class FingerConfig(Table):
     tip: str
     """MJCF site at its tip"""
     joints: tuple[str, ...] = Field(min_length=1)
-    """its joints, base to tip; of robot.joints"""
+    """joints of the finger, a part of robot.joints, base to tip"""
 
 
 class HandConfig(Table):
-    """`[robot.hand]`: a hand whose joints are driven by pairs of tendons, which can only pull. One
-    value per joint.
+    """`[robot.hand]`: a hand whose joints are driven by pairs of tendons, which can only pull.
+
+    Lists have one value per joint.
     """
 
     finger: tuple[FingerConfig, ...] = Field(min_length=1)
@@ -286,14 +316,14 @@ class HandConfig(Table):
     flexors: tuple[str, ...]
     """MJCF actuators on the tendons that turn a joint in positive direction"""
     extensors: tuple[str, ...]
-    """MJCF actuators on the tendons that turn it back"""
+    """MJCF actuators on the tendons that turn a joint in negative direction"""
     least: Positive
     """tension below which a tendon is slack, N"""
     rest: Positive
-    """mean tension of a pair at rest, N; it stiffens nothing in a linear tendon"""
+    """mean tension of a pair at rest, N; it does not stiffen joints with linear tendons"""
     closed: NotNegative = 0.0
-    """stiffness of a tendon whose valve is closed, by the air in it, N/m; 0: it keeps its
-    tension"""
+    """stiffness of a tendon whose valve is closed, due to the enclosed air, N/m; with 0 it keeps
+    its tension"""
 
 
 class ToolConfig(Table):
@@ -302,12 +332,13 @@ class ToolConfig(Table):
     position: Vector = (0.0, 0.0, 0.0)
     """of the tool in the body's frame, m"""
     quaternion: tuple[Finite, Finite, Finite, Finite] = (1.0, 0.0, 0.0, 0.0)
-    """of the tool in the body's frame, as w, x, y, z; its z axis approaches"""
+    """of the tool in the body's frame, as w, x, y, z; its z axis is the direction of approach"""
 
 
 class RobotConfig(Table):
-    """`[robot]`: an arm, by its MJCF file and the data missing there. Lists have one value per
-    joint.
+    """`[robot]`: an arm, given by its MJCF file and data that the file lacks.
+
+    Lists have one value per joint.
     """
 
     model: Path = Field(strict=False)
@@ -321,10 +352,10 @@ class RobotConfig(Table):
     tool_offset: ToolConfig | None = None
     """pose of the tool on the body that `tool` names; default: the body's own"""
     home: tuple[Finite, ...] = Field((), min_length=1)
-    """joint positions to which tasks return, and the simulated start, rad; default: those of the
+    """joint positions to which tasks return, and the simulated start, rad; default: the
     first keyframe"""
     start: tuple[Finite, ...] | None = None
-    """where the simulated arm starts, rad; default: home"""
+    """start position of the simulated arm, rad; default: home"""
     velocity: tuple[Positive, ...]
     """velocity limits, rad/s"""
     acceleration: tuple[Positive, ...]
@@ -336,85 +367,87 @@ class RobotConfig(Table):
     position: tuple[tuple[Finite, Finite], ...] | None = None
     """position limits, rad; default: the model's joint ranges"""
     interface: Interface = "torque"
-    """what the drives take in every cycle: torques, or set points of position or velocity, which
-    they follow by loops of their own; the simulated arm's drives are such, too"""
+    """command that the drives accept in every cycle: torques, or set points of position or velocity
+    for drives that close their control loops themselves, which the simulated arm does, too"""
     exclude: tuple[tuple[str, str], ...] = ()
-    """pairs of MJCF bodies whose contacts do not count, beside the model's own"""
+    """pairs of MJCF bodies whose contacts are ignored, in addition to the model's exclusions"""
     gripper: GripperConfig | None = None
     """gripper, if the arm has one"""
     sensors: SensorConfig | None = None
     """resolution and noise of the joints' encoders; default: exact if they are simulated, 1e-4 and
     5e-5 rad otherwise, see `rack.levels.arm.Arm.sensors`"""
     calibration: CalibrationConfig = CalibrationConfig()
-    """from the drives' samples to positions"""
+    """conversion of the drives' samples to joint positions"""
     latency_ticks: int = Field(0, ge=0, le=20)
-    """age of the newest sample when a cycle reads it, ticks, as a bus to the drives has it; the
-    simulated arm's samples are that old, too"""
+    """age of the newest sample when a cycle reads it, due to the bus to the drives, ticks; the
+    simulated arm delays its samples accordingly"""
     wrist: WristConfig | None = None
     """force/torque sensor, if the arm has one"""
     hand: HandConfig | None = None
     """tendons and fingers, for a hand in place of an arm"""
     patience_ms: Positive | None = Field(None, le=100.0)
-    """time without a new torque for which motors keep the last one, ms; then the brakes engage;
-    rounded down to whole torque cycles, at least one; default: by what the arm does in it, see
-    `rack check --verbose`"""
+    """time for which motors keep the last torque when no new one arrives, ms; then the brakes
+    engage; rounded down to whole torque cycles, at least one; the default depends on the arm's
+    motion in that time, see `rack check --verbose`"""
     substeps: int = Field(5, ge=1, le=50)
     """MuJoCo steps in one servo cycle"""
     min_armature: Finite = Field(0.05, ge=0)
-    """least drive inertia of every joint, kg m2: light wrists need it"""
+    """minimum drive inertia of every joint, kg m2; light wrists need it"""
     enable: Literal["at-start", "by-command"] | None = None
-    """when drives are asked for torque: at the start, or by `rack command RACK servo enable`;
+    """when drives are enabled: at the start, or by `rack command RACK servo enable`;
     default: at-start for the simulated arm, by-command for every other"""
     bring_up: Positive | None = Field(None, le=1.0)
-    """part of full speed at which the arm moves until `rack command RACK servo release`; default:
-    full speed from the start"""
+    """fraction of full speed at which the arm moves until `rack command RACK servo release`;
+    default: full speed from the start"""
     guessed: tuple[str, ...] = ()
-    """keys of this table whose values were guessed, as in gripper.force: an arm that is not
-    simulated is not enabled before each is confirmed, by removing it here"""
+    """keys of this table whose values were guessed, such as gripper.force; an arm that is not
+    simulated is not enabled until each is confirmed by removing it here"""
 
     def misfits(self) -> Iterator[tuple[str, Any, str]]:
-        """Yield key, values and reason for every list without one value per joint."""
+        """Yield key, values and reason for every list that does not have one value per joint."""
         joints = len(self.joints)
         keys = ("home", "start", "velocity", "acceleration", "jerk", "torque", "position")
         lists = {key: getattr(self, key) for key in keys}
         lists["calibration.offset"] = self.calibration.offset
         for key, values in lists.items():
             if values is not None and len(values) != joints:
-                yield key, values, f"{len(values)} values; permitted: {joints}, one per joint"
+                yield key, values, f"has {len(values)} values but needs {joints}, one per joint"
         for key, values in self.sensors or ():
             if isinstance(values, tuple) and len(values) != joints:
-                permitted = f"one for all joints, or {joints}, one per joint"
-                yield f"sensors.{key}", values, f"{len(values)} values; permitted: {permitted}"
+                why = f"has {len(values)} values but needs one for all joints, or one per joint"
+                yield f"sensors.{key}", values, f"{why}: {joints}"
 
     @field_validator("guessed")
     @classmethod
     def _are_keys(cls, names: tuple[str, ...]) -> tuple[str, ...]:
         for name in names:
             if name.partition(".")[0] not in cls.model_fields:
-                raise ValueError(f"'{name}' is no key of [robot]; `rack schema robot` lists them")
+                raise ValueError(
+                    f"'{name}' is not a key of [robot]; `rack schema robot` lists them"
+                )
         return names
 
     @property
     def tool_name(self) -> str:
-        """The site whose pose is the tool's: one that the table places has a name of its own."""
+        """Name of the site whose pose is the pose of the tool. With `tool_offset`, a new name."""
         return self.tool if self.tool_offset is None else f"tool of {self.tool}"
 
 
 class MotionConfig(Table):
-    """A move of an obstacle, a mocap body, which the simulated cell makes at a fixed time."""
+    """A move of an obstacle, a mocap body, in the simulated cell at a fixed time."""
 
     body: str
     """obstacle that moves"""
     at: Moment
     """simulated time when it starts, s"""
     to: Vector
-    """where its origin goes, m"""
+    """final position of its origin, m"""
     speed: Positive = 0.25
     """speed along the straight line, m/s"""
 
 
 class PushConfig(Table):
-    """`[[scene.push]]`: a force on an object, which the simulated cell exerts at a fixed time."""
+    """`[[scene.push]]`: a force on an object in the simulated cell at a fixed time."""
 
     body: str
     """object that is pushed"""
@@ -425,33 +458,34 @@ class PushConfig(Table):
     force: Vector
     """force at the centre of mass, in the world's frame, N"""
     rise: NotNegative = 0.0
-    """time in which it rises, and in which it falls at its end, s"""
+    """time in which the force rises at the start and falls at the end, s"""
 
 
 class GoalConfig(Table):
-    """`[[scene.goal]]`: where the task takes an object. A task of transfers states goals by
-    itself.
+    """`[[scene.goal]]`: where the task takes an object.
+
+    Not needed for a task of transfers, which has its goals in the program.
     """
 
     object: str
-    """object that the task moves, or keeps"""
+    """object that the task moves, or leaves in place"""
     position: Vector
-    """where its origin ends, m"""
-    # A gripper centres a part across its pads, not along them: there it stays as far off as it was
-    # taken, or slips.
+    """final position of its origin, m"""
+    # A gripper centres a part across its pads, but not along them. In that direction the part keeps
+    # its offset, or slips.
     tolerance_mm: Positive = 10.0
-    """distance from there at which the task still counts as done, mm"""
+    """distance from the goal within which the task counts as done, mm"""
 
 
 class SceneConfig(Table):
-    """`[scene]`: objects and obstacles in the cell, by their names in the MJCF."""
+    """`[scene]`: objects and obstacles in the cell, by their names in the MJCF file."""
 
     objects: tuple[str, ...] = ()
     """free bodies that tasks may move"""
     obstacles: tuple[str, ...] = ()
     """mocap bodies that may move by themselves"""
     supports: tuple[str, ...] = ()
-    """geoms on which objects may stand, and a tool on a wrist sensor may press"""
+    """geoms on which objects may stand, and on which a tool on a wrist sensor may press"""
     clearance: Positive = 0.015
     """distance that planned motion keeps from everything, m"""
     motion: tuple[MotionConfig, ...] = ()
@@ -459,9 +493,9 @@ class SceneConfig(Table):
     push: tuple[PushConfig, ...] = ()
     """forces on objects, by time"""
     goal: tuple[GoalConfig, ...] = ()
-    """where objects end, if the task is done"""
+    """where objects are when the task is done"""
 
     @property
     def bodies(self) -> tuple[str, ...]:
-        """Objects, then obstacles: the order of the world model's rows."""
+        """Objects, then obstacles, in the order of the rows of the world model."""
         return self.objects + self.obstacles

@@ -1,6 +1,4 @@
-"""The world model: global memory of objects and obstacles, updated from sensing, read by every
-planner.
-"""
+"""The world model: objects and obstacles as sensed, for all planners."""
 
 from __future__ import annotations
 
@@ -15,24 +13,24 @@ from rack.levels.tables import Positive, Table, read_params
 
 
 class WorldParams(Table):
-    """When a body counts as moving."""
+    """Thresholds by which a body counts as moving or resting."""
 
     moved: Positive = 0.002
-    """distance from where it rested at which a body moves, m"""
+    """distance from its resting place beyond which a body counts as moving, m"""
     turned: Positive = 0.02
-    """angle from how it rested at which a body moves, rad"""
+    """angle from its resting orientation beyond which a body counts as moving, rad"""
     slow: Positive = 0.005
-    """speed below which a moving body may be resting, m/s"""
+    """speed below which a moving body may come to rest, m/s"""
     resting: Positive = 0.2
-    """time of being slow after which it rests, s"""
+    """time at low speed after which a body counts as resting, s"""
 
 
 class WorldModel(Executor):
-    """Follows the bodies of the scene: poses, velocities, and a revision that rises when a body
-    starts or stops moving.
+    """Executor that tracks the bodies of the scene: poses, velocities, and a revision.
 
-    The revision is the tick after the last such change, so it also rises across a restart of this
-    board. Until it receives a scene, a restarted board publishes its last model, with its age.
+    The revision increases when a body starts or stops moving. It is the tick after the last such
+    change, so that it also increases across a restart of this board. Until it receives a scene, a
+    restarted board publishes its last model, with its age.
     """
 
     scene = Input(Scene, "servo.scene")
@@ -44,7 +42,7 @@ class WorldModel(Executor):
         super().__init__(context)
         self._params = read_params(WorldParams, context.params)
         bodies = context.sizes["bodies"]
-        # Poses in the last scene, and in which bodies rested: m, 1.
+        # Poses in the last scene, and poses in which bodies last rested: m, and quaternions.
         self._last, self._rest = np.zeros((2, bodies, 7))
         self._moving = np.zeros(bodies, dtype=bool)
         self._slow_s = np.zeros(bodies)
@@ -53,7 +51,7 @@ class WorldModel(Executor):
         self._started = False
 
     def process(self, tick: int) -> None:
-        """Update from a new scene; when one is missing, keep poses and set velocities to zero."""
+        """Update from a new scene. When one is missing, keep poses and set velocities to 0."""
         model = self.model
         if not self._started:
             self._started = True
@@ -77,7 +75,16 @@ class WorldModel(Executor):
         model.sensed = self._seen_tick = tick
 
     def _follow(self, poses: Array, velocity: Array, elapsed_s: float) -> bool:
-        """Estimate velocities; return whether a body starts or stops moving."""
+        """Update the velocities from new poses.
+
+        Args:
+            poses: Poses of the bodies, (bodies, 7).
+            velocity: Receives the estimated velocities, (bodies, 3), m/s.
+            elapsed_s: Time since the last scene, s.
+
+        Returns:
+            True if a body starts or stops moving.
+        """
         p = self._params
         slow_turn = p.turned / p.resting * elapsed_s
         is_slow = (distances(poses, self._last) / elapsed_s < p.slow) & (
@@ -96,14 +103,15 @@ class WorldModel(Executor):
 
 
 def distances(poses: Array, others: Array) -> Array:
-    """Return the distances, m, of poses from others, both (bodies, 7)."""
+    """Return the distances between corresponding poses, m; both are (bodies, 7)."""
     x, y, z = (poses - others)[:, :3].T
     return np.asarray(np.sqrt(x * x + y * y + z * z))
 
 
 def turns(poses: Array, others: Array) -> Array:
-    """Return the angles, rad, between the orientations of poses, both (bodies, 7); q and -q are the
-    same.
+    """Return the angles between the orientations of corresponding poses, rad.
+
+    Both are (bodies, 7). The quaternions q and -q are the same orientation.
     """
     w, x, y, z = (poses * others)[:, 3:].T
     return 2.0 * each(math.acos, np.minimum(np.abs(w + x + y + z), 1.0))

@@ -1,6 +1,4 @@
-"""The arm: its interface to the servo level, the simulated one, and the faults injected between the
-two.
-"""
+"""The interface between servo level and arm, the simulated arm, and injected faults."""
 
 from rack.levels import compiled
 from rack.levels.arm import drives, sensors, substeps

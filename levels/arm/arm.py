@@ -1,11 +1,12 @@
-"""The seam between the servo level and an arm: sense, drive, brake, and let time pass.
+"""The base class of every arm: sense, drive, brake, and advance time.
 
-The servo level drives whatever class `[board.servo.params] arm = "package.module:Class"` names: the
-simulated arm by default, your own hardware or simulation otherwise. In every cycle it calls, in
-this order, `step` (the ticks since the last cycle), `sense`, then either `drive` (`follow` for
-drives that take set points) or `brake` or neither (the last command stays in force), `save` and
-`look`. All calls come from the executor's process, within its cycle: none may block. An exception
-ends the board, which is restarted as after any crash; report a broken arm in `fault` instead.
+The servo level drives the class that `[board.servo.params] arm = "package.module:Class"` names. The
+default is the simulated arm; it may be your own hardware or simulation. In every cycle the servo
+level calls, in this order: `step` (with the ticks since the last cycle), `sense`, one of `drive`
+(`follow` for drives that take set points), `brake` or neither (the last command stays in force),
+`save` and `look`. All calls come from the executor's process, within its cycle, so none may block.
+An exception ends the board, which is restarted as after any crash. Report a broken arm in `fault`
+instead.
 """
 
 from __future__ import annotations
@@ -24,48 +25,62 @@ from rack.levels.tables import SensorConfig
 
 
 class Arm(BrakedArm):
-    """Base of every arm: it is guarded, unless its drives keep its limits.
+    """Base class of every arm. It is driven through a guard, unless its drives keep its limits.
 
-    Subclasses write `sense`, `brake`, `step` and, as their drives take torques or set points,
-    `drive` or `follow`, and keep the attributes of `DrivableArm` up to date. All else has a default
-    that suits an arm without contact sensors, whose state outlives its board.
+    Subclasses write `sense`, `brake`, `step`, and `drive` or `follow`, depending on whether the
+    drives take torques or set points. They keep the attributes of `DrivableArm` up to date.
+    Everything else has a default that suits an arm without contact sensors whose state survives its
+    board.
     """
 
     keeps_limits = False
-    """The simulated arm's drives do. Every other arm is driven through
-    `rack.levels.arm.guard.GuardedArm`."""
+    """True if the drives keep the limits, as the simulated arm's drives do.
+
+    Every other arm is driven through `rack.levels.arm.guard.GuardedArm`.
+    """
     sensors = SensorConfig(resolution=1e-4, noise=5e-5)
-    """Default: 16 bits a turn; and samples that are taken up to 0.1 ms early or late, which is 0.3
-    mrad at 3 rad/s, six times this noise."""
+    """Default encoders.
+
+    The resolution is 16 bits per turn. The noise covers samples that are taken up to 0.1 ms early
+    or late, which is 0.3 mrad at 3 rad/s, six times this noise.
+    """
     _guard: GuardedArm | None = None
 
     def connect(
-        self, tick_s: float, part: float, acted: dict[int, bool], holds: Callable[[], bool]
+        self,
+        tick_s: float,
+        speed_fraction: float,
+        acted: dict[int, bool],
+        holds: Callable[[], bool],
     ) -> ArmLinks:
-        """Return the path that the servo level drives it through; see `DrivableArm.connect`."""
+        """Return the links between servo level and arm; see `DrivableArm.connect`."""
         link = present_link(self, tick_s)
         if not self.keeps_limits:
-            link = self._guard = GuardedArm(self, tick_s, link, part)
+            link = self._guard = GuardedArm(self, tick_s, link, speed_fraction)
         return ArmLinks(link, FaultyLink(self, acted, link, holds))
 
-    def permit(self, part: float) -> None:
-        """Let the path keep velocities within another `part` of their limits."""
+    def permit(self, speed_fraction: float) -> None:
+        """Change the fraction of their limits below which the link keeps velocities."""
         if self._guard is not None:
-            self._guard.permit(part)
+            self._guard.permit(speed_fraction)
 
     @classmethod
-    def misfit(cls, cell: Cell, part: float) -> str:
-        """Return why `connect` would fail for a cell, before the launch; empty: it would not."""
+    def misfit(cls, cell: Cell, speed_fraction: float) -> str:
+        """Return why `connect` would fail for a cell. Empty if it would not.
+
+        Called before the launch.
+        """
         try:
             if not cls.keeps_limits:
-                kept_bounds(cell, part)
+                kept_bounds(cell, speed_fraction)
         except RobotError as error:
             return str(error)
         return ""
 
     def look(self, scene: Scene) -> None:
-        """Fill a `SCENE` with the poses of bodies and tool. Default: bodies at their start, the
-        tool as sensed.
+        """Fill a `Scene` with the poses of bodies and tool.
+
+        By default bodies are at their start and the tool is where the joint sensors place it.
         """
         offset = self.cell.encoders.offset
         position = self.sense().position

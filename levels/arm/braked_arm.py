@@ -1,4 +1,4 @@
-"""What every arm does for the servo level: it counts, refuses, and reports its brakes."""
+"""Behaviour common to all arms: they refuse invalid torques, and count and report braking."""
 
 from __future__ import annotations
 
@@ -17,18 +17,26 @@ from rack.levels.robot.dynamics import Dynamics
 from rack.levels.tables import Interface, SceneConfig
 
 TORQUE_MARGIN = 1.001
-"""Multiple of a torque limit beyond which a command is refused: the servo level keeps the limits
-itself."""
+"""Multiple of a torque limit beyond which a command is refused.
+
+The servo level keeps the limits itself; the margin is for rounding.
+"""
 
 
 class BrakedArm(Plant, DrivableArm):
-    """Refuses torques beyond the limits, and reports its brakes. Implements `Link`."""
+    """An arm that refuses torques beyond the limits and reports its brakes. Implements `Link`."""
 
     def __init__(
         self, cell: Cell, scene: SceneConfig, clock_ns: int, every: int = 1, seed: int = 0
     ) -> None:
-        """Start braked at home. One tick is `clock_ns`, one torque cycle `every` ticks; `seed` is
-        for random noise.
+        """Start with engaged brakes at the start position.
+
+        Args:
+            cell: The arm and its surroundings.
+            scene: The `[scene]` table.
+            clock_ns: Duration of a tick, ns.
+            every: Length of a torque cycle, ticks.
+            seed: Seed of the random noise.
         """
         super().__init__(cell)
         self.every = every  # ticks of a cycle
@@ -40,56 +48,64 @@ class BrakedArm(Plant, DrivableArm):
         self.state = DriveState.DISABLED  # of the drives, as of the last `step`
         # Reason (see `Alarm.BRAKES_CLOSED`) and first tick of braking. None while released.
         self._brakes: tuple[int, int] | None = (AT_START, self.tick)
-        # Used by the level that drives the arm, and by an arm that senses exactly.
+        # For the level that drives the arm, and for an arm that senses exactly.
         self.dynamics = Dynamics(cell)
         self._permitted = TORQUE_MARGIN * cell.bounds.torque
 
     @abstractmethod
     def sense(self) -> Sensed:
-        """Return the newest sample, see `Link.sense`."""
+        """Return the newest sample; see `Link.sense`."""
 
     def drive(self, torque: Array, grip_force: float) -> Finding | None:
-        """Release the brakes and apply torques, N m, and grip force, N; see `Link.drive`. Sets
-        `waited` to 0. Default: refused, see `takes`.
+        """Release the brakes and apply torques, N m, and grip force, N; see `Link.drive`.
+
+        Sets `waited` to 0. By default it is not implemented; see `has_interface`.
         """
         raise NotImplementedError
 
     def follow(self, target: JointTarget, grip_force: float) -> Finding | None:
-        """Release the brakes and follow; see `Link.follow`. Sets `waited` to 0, and `torque` to
-        what is predicted or reported. Default: refused, see `takes`.
+        """Release the brakes and follow a set point; see `Link.follow`.
+
+        Sets `waited` to 0, and `torque` to the predicted or reported torque. By default it is not
+        implemented; see `has_interface`.
         """
         raise NotImplementedError
 
     @classmethod
     def takes(cls, interface: Interface) -> bool:
-        """Say whether the drives have an interface: `rack check` refuses a config that names
-        another. Default: by the methods that the class has.
+        """Return True if the drives have an interface.
+
+        `rack check` refuses a config that names another one. By default the methods that the class
+        implements decide.
         """
         if interface == "torque":
             return cls.drive is not BrakedArm.drive
         return cls.follow is not BrakedArm.follow
 
     def enable(self) -> None:
-        """Ask the drives for torque; does not block: `state` becomes ENABLED in a later `step`.
+        """Request that the drives be enabled, without blocking.
 
-        Until then, and whenever the arm is not enabled, it is braked in every cycle. Default:
-        drives that know no states are enabled at once.
+        `state` becomes ENABLED in a later `step`. Until then, and whenever the arm is not enabled,
+        it is braked in every cycle. By default drives have no states and are enabled at once.
         """
         self.state = DriveState.ENABLED
 
     def disable(self) -> None:
-        """Ask the drives to give no torque any more. Default: the brakes do it, at once."""
+        """Request that the drives be disabled. By default the brakes engage at once."""
         self.brake()
         self.state = DriveState.DISABLED
 
     def reset(self) -> None:
-        """Ask drives in FAULT to leave it, for DISABLED, and clear `fault`, which says why they
-        were in it. Default: they cannot.
+        """Request that drives in FAULT change to DISABLED, and clear `fault`.
+
+        By default drives have no faults to reset.
         """
 
     def refused(self, torque: Array) -> Finding | None:
-        """Return why `torque`, (joints,), N m, must not be applied: NaN, infinite, beyond a limit;
-        None: it may. The caller then brakes; the refusal is counted and reported here.
+        """Return why a torque must not be applied. None if it may be applied.
+
+        A torque that is NaN, infinite or beyond a limit is refused. The method counts
+        and reports the refusal; the caller has to engage the brakes. `torque` is (joints,), N m.
         """
         if np.count_nonzero(np.abs(torque) <= self._permitted) == torque.size:
             return None
@@ -99,7 +115,7 @@ class BrakedArm(Plant, DrivableArm):
         return self.refuse(Finding(Alarm.COMMAND_INVALID, int((~np.isfinite(torque)).argmax())))
 
     def report_waiting(self) -> None:
-        """Add to the findings that the arm has engaged its brakes by itself, between two cycles."""
+        """Report a finding if the arm has engaged its brakes by itself since the last cycle."""
         if self._brakes is None and self.braked:
             if self.state is not DriveState.ENABLED:
                 self._report_brakes(Error.DRIVES, self.tick)
@@ -108,7 +124,7 @@ class BrakedArm(Plant, DrivableArm):
                 self._report_brakes(NO_TORQUE, since, self.waited - self.every)
 
     def report_cycle(self) -> None:
-        """Add to the findings what a cycle did to the brakes, each time, however short; and why."""
+        """Report, with the reason, every change of the brakes in a cycle, however short."""
         super().report_cycle()
         why = self.brake_cause
         self.brake_cause = Error.NONE
@@ -122,11 +138,15 @@ class BrakedArm(Plant, DrivableArm):
                 self.findings.append(Finding(Alarm.BRAKES_OPENED, why, self.tick - since))
 
     def _report_brakes(self, why: int, since: int, missed: int = 0) -> None:
+        """Report that the brakes engaged at tick `since`, with `missed` ticks without command."""
         self._brakes = why, since
         self.findings.append(Finding(Alarm.BRAKES_CLOSED, why, missed, since))
 
     def restore(self, state: ArmState) -> None:
-        """Continue from an `ARM_STATE`. Default: drives that know no states are as they were."""
+        """Continue from an `ArmState`.
+
+        By default drives have no states, so they are enabled unless they had been disabled.
+        """
         super().restore(state)
         was_disabled = state.error == Error.DISABLED
         self.state = DriveState.DISABLED if was_disabled else DriveState.ENABLED
@@ -134,27 +154,28 @@ class BrakedArm(Plant, DrivableArm):
 
     @property
     def holds(self) -> bool:
-        """Whether the gripper touches a part. Default: False."""
+        """True if the gripper touches an object. By default False."""
         return False
 
     @property
     def leans(self) -> bool:
-        """Whether the arm, or its load, touches anything else. Default: False."""
+        """True if the arm, or its load, touches anything else. By default False."""
         return False
 
     def named(self, contact: tuple[int, int]) -> str:
-        """Return a `contact` in words. Default: the numbers of the geoms."""
+        """Describe a `contact` as text. By default it has the numbers of the geoms."""
         return f"geom {contact[0]} touches geom {contact[1]}"
 
     def weaken(self, most: Array | None) -> None:
-        """Limit the motors' torque to `most`, (joints,), N m, as if they were weak; None: they are
-        sound.
+        """Limit the motor torques as if the motors were weak.
 
-        Injected faults of motors act through this. Default: they have no effect.
+        Injected faults of motors act through this. By default they have no effect. `most` is
+        (joints,), N m, or None for intact motors.
         """
 
     def feel(self) -> Array | None:
-        """Return the newest sample of the wrist sensor, (6,), N, N m, in its frame. Default: None,
-        it has none.
+        """Return the newest sample of the wrist sensor, (6,), N and N m, in its frame.
+
+        None, the default, if the arm has none.
         """
         return None

@@ -1,6 +1,4 @@
-"""The commands of the boards above that drive an arm, or a hand, together: all of them must be
-fresh.
-"""
+"""Freshness of the commands of several boards that drive an arm, or a hand, together."""
 
 from __future__ import annotations
 
@@ -12,17 +10,27 @@ from rack.levels.robot.limits import MotorPatience
 
 
 class CommandsAbove:
-    """Says whether the commands of the boards above are there and fresh; `oldest`: the ages
-    permitted, ticks, by board.
+    """Check that the commands of all boards above are present and fresh.
 
-    In messages they are called `what`, and the arm, or hand, is `halted` while one is missing. A
-    command rests on a status of a cycle ago and takes `cycles` of its board; then the motors, or
-    valves, keep it.
+    A command is based on a status of the previous cycle and takes `cycles` cycles of its board;
+    then the motors, or valves, keep it for their patience.
+
+    Attributes:
+        oldest: Maximum age of a command, ticks, by board.
     """
 
     def __init__(
         self, context: LevelContext, patience: MotorPatience, cycles: int, what: str, halted: str
     ) -> None:
+        """Derive the maximum ages from the cycles of the boards.
+
+        Args:
+            context: The level that reads the commands.
+            patience: Time for which motors, or valves, keep a command.
+            cycles: Cycles of its board that a command takes.
+            what: Name of the commands in messages.
+            halted: State of the arm, or hand, while a command is missing, in messages.
+        """
         self._what = what
         self._halted = halted
         self.oldest = {
@@ -33,8 +41,12 @@ class CommandsAbove:
     def missing(
         self, commands: Mapping[str, Reading[SampledCommand]], tick: int, since: int
     ) -> str:
-        """Return why commands are missing at `tick`; empty: all are fresh, and rest on a status of
-        `since` or later.
+        """Return why commands are missing. Empty if all are fresh.
+
+        Args:
+            commands: Readings of the commands, by board.
+            tick: Present tick.
+            since: Tick of the oldest status on which all commands must be based.
         """
         all_know = True
         for board, oldest in self.oldest.items():

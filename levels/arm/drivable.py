@@ -1,4 +1,4 @@
-"""What the servo level asks of an arm."""
+"""Interface of an arm to the servo level."""
 
 from __future__ import annotations
 
@@ -16,215 +16,246 @@ from rack.levels.tables import Interface, SceneConfig, SensorConfig, named_class
 
 
 class DriveState(IntEnum):
-    """State of an arm's drives: those of CiA 402, reduced to what a level above must tell apart."""
+    """State of an arm's drives: the CiA 402 states, reduced to what levels distinguish."""
 
     DISABLED = 0  # up to "switched on", without a request: no power, brakes engaged
-    ENABLING = 1  # asked for: on the way to "operation enabled", homing included
-    ENABLED = 2  # "operation enabled": torques act; in "quick stop active" none would
-    FAULT = 3  # "fault reaction active" and "fault": until `Arm.reset`
+    ENABLING = 1  # on the way to "operation enabled", including homing
+    ENABLED = 2  # "operation enabled": torques act, unlike in "quick stop active"
+    FAULT = 3  # "fault reaction active" and "fault", until `Arm.reset`
 
 
 class Sensed(NamedTuple):
-    """One sample of the arm's sensors; joints are as coarse and noisy as their encoders."""
+    """One sample of the arm's sensors.
+
+    Joint values have the resolution and noise of the encoders.
+    """
 
     position: Array  # (joints,), rad
     velocity: Array  # (joints,), rad/s
     opening: float  # gripper joint, m; 0 without a gripper
     opening_velocity: float  # m/s
-    tick: int  # of the sample: an older one than that of the cycle counts as no new sample
+    tick: int  # tick of the sample; if older than the cycle's, there is no new sample
 
 
 class JointTarget(NamedTuple):
-    """Set points of the joints for the end of a cycle; arrays are (joints,)."""
+    """Set points of the joints for the end of a cycle. Arrays are (joints,)."""
 
     position: Array  # rad
-    velocity: Array  # rad/s; for drives of velocity corrected by the error of the position
-    torque: Array  # N m: predicted for the motion, payload included
+    velocity: Array  # rad/s; for velocity drives, corrected for the position error
+    torque: Array  # N m: predicted for the motion, including the payload
 
 
 class Exceeded(NamedTuple):
-    """A limit that a joint is beyond: what found it, and in words."""
+    """Violation of a joint limit by a sample."""
 
     finding: Finding
-    text: str
+    text: str  # description for the user
 
 
 def copied(sample: Sensed) -> Sensed:
-    """Return a sample whose arrays stay valid."""
+    """Return a copy of a sample, with arrays that stay valid."""
     return sample._replace(position=sample.position.copy(), velocity=sample.velocity.copy())
 
 
 class Link(Protocol):
-    """The path between the servo level and an arm: samples come up, torques or set points go
-    down.
+    """The path between the servo level and an arm.
+
+    Samples come up, torques or set points go down.
     """
 
     def sense(self) -> Sensed:
         """Return the newest sample. The arrays are valid until the next call."""
 
     def drive(self, torque: Array, grip_force: float) -> Finding | None:
-        """Release the brakes and apply torques, (joints,), N m, and the gripper's force, N, for one
-        torque cycle.
+        """Release the brakes and apply torques for one torque cycle.
 
-        A torque that must not be applied (see `Arm.refused`) engages the brakes, and the finding is
-        returned.
+        A torque that must not be applied (see `BrakedArm.refused`) engages the brakes.
+
+        Args:
+            torque: Joint torques, (joints,), N m.
+            grip_force: Force of the gripper, N.
+
+        Returns:
+            Why the torque was refused. None if it was applied.
         """
 
     def follow(self, target: JointTarget, grip_force: float) -> Finding | None:
-        """Release the brakes, and let the drives be at `target` in one cycle; then they go on at
-        that velocity. Otherwise as `drive`.
+        """Release the brakes and let the drives reach `target` at the end of the cycle.
+
+        Afterwards they continue at its velocity. Otherwise as `drive`.
         """
 
 
 class FaultyPath(Link, Protocol):
-    """The same path with injected faults."""
+    """Link with injected faults."""
 
     def inject(self, faults: Sequence[Fault]) -> None:
-        """Replace the active faults."""
+        """Replace the active faults by `faults`."""
 
 
 class ArmLinks(NamedTuple):
-    """The path between the servo level and an arm, in use without and with injected faults."""
+    """Links between the servo level and an arm, without and with injected faults."""
 
     sound: Link
     faulty: FaultyPath
 
 
 class DrivableArm(ABC):
-    """An arm whose joints have drives and brakes, and a force-driven gripper.
+    """An arm whose joints have drives and brakes, and a force-controlled gripper.
 
-    Its limits are kept by its own drives, or by the link that `connect` returns. Subclass
-    `rack.levels.arm.Arm`, which has that link, the counters and the reports.
+    Its drives, or the link that `connect` returns, keep its limits. Do not subclass it directly,
+    but `rack.levels.arm.Arm`, which has that link, the counters and the reports.
     """
 
     keeps_limits: ClassVar[bool]
-    """Whether its drives keep positions and velocities within the limits by themselves."""
+    """True if its drives keep positions and velocities within the limits by themselves."""
     sensors: ClassVar[SensorConfig]
-    """Its encoders, where `[robot.sensors]` does not say."""
+    """Its encoders, unless `[robot.sensors]` states them."""
     reports_torque = False
-    """Whether, after `follow`, `torque` is what the motors give throughout the coming cycle. Else
-    it is what was predicted, and only the following error tells that a motor has failed."""
+    """True if `torque` is the torque of the motors for the coming cycle after `follow`.
+
+    Otherwise it is the predicted torque, and only the following error shows that a motor has
+    failed.
+    """
     exceeded: Exceeded | None = None
-    """The limit that the newest sample is beyond, where the link judges samples."""
+    """Limit that the newest sample exceeds, if the link judges samples."""
 
     dynamics: Dynamics  # for the level that drives the arm
-    tick: int  # of the state
-    state: DriveState  # of the drives, as of the last `step`
-    torque: Array  # (joints,), N m: given to the motors last
-    grip_force: float  # N: given to the gripper last
-    braked: bool  # the brakes are engaged
-    brake_cause: int  # of brakes that engage in this cycle: see their alarm
-    fault: str  # why it has failed and moves no more; empty: it has not
-    contact: tuple[int, int] | None  # geoms of an unintended contact, of it or its load, in a step
+    tick: int  # present tick
+    state: DriveState  # of the drives, after the last `step`
+    torque: Array  # (joints,), N m: last torque of the motors
+    grip_force: float  # N: last force of the gripper
+    braked: bool  # True while the brakes are engaged
+    brake_cause: int  # cause if brakes engage in this cycle, see `Alarm.BRAKES_CLOSED`
+    fault: str  # why the arm has failed and cannot move. Empty if it has not
+    contact: tuple[int, int] | None  # geoms of an unintended contact of arm or load in a step
     clipped: int  # cycles in which a command was refused or cut
     touches: int  # unintended contacts so far
-    first_touch: str  # the first of them, readable: which geoms, and when
+    first_touch: str  # description of the first unintended contact
     violations: int  # steps in which the drives broke a limit of position, velocity or torque
-    first_violation: str  # the first of them, readable: which limit, by how much, and when
+    first_violation: str  # description of the first violation
     pushed: int  # steps in which a blow pushed a joint beyond a limit of position or velocity
 
     @abstractmethod
     def __init__(
         self, cell: Cell, scene: SceneConfig, clock_ns: int, every: int = 1, seed: int = 0
     ) -> None:
-        """Start braked at home. One tick is `clock_ns`, one torque cycle `every` ticks; `seed` is
-        for random noise.
+        """Start with engaged brakes at the start position.
+
+        Args:
+            cell: The arm and its surroundings.
+            scene: The `[scene]` table.
+            clock_ns: Duration of a tick, ns.
+            every: Length of a torque cycle, ticks.
+            seed: Seed of the random noise.
         """
 
     @abstractmethod
     def connect(
-        self, tick_s: float, part: float, acted: dict[int, bool], holds: Callable[[], bool]
+        self,
+        tick_s: float,
+        speed_fraction: float,
+        acted: dict[int, bool],
+        holds: Callable[[], bool],
     ) -> ArmLinks:
-        """Return the path that the servo level drives it through.
+        """Return the links through which the servo level drives the arm.
 
         Args:
-            tick_s: One tick, s.
-            part: Part of their limits within which velocities are kept.
-            acted: Collects the faults that act, for `Executor.acted`.
-            holds: Whether the gripper holds a part, for all that the level knows.
+            tick_s: Duration of a tick, s.
+            speed_fraction: Fraction of their limits below which velocities are kept.
+            acted: Collects the faults that have an effect, for `Executor.acted`.
+            holds: Returns True if the gripper may hold an object, as far as the level knows.
 
         Raises:
-            RobotError: Encoders are too coarse to tell a limit.
+            RobotError: The encoders are too coarse to detect a violated limit.
         """
 
     @abstractmethod
-    def permit(self, part: float) -> None:
-        """Let the path keep velocities within another `part` of their limits."""
+    def permit(self, speed_fraction: float) -> None:
+        """Change the fraction of their limits below which the link keeps velocities."""
 
     @classmethod
     @abstractmethod
-    def misfit(cls, cell: Cell, part: float) -> str:
-        """Return why `connect` would fail for a cell, before the launch; empty: it would not."""
+    def misfit(cls, cell: Cell, speed_fraction: float) -> str:
+        """Return why `connect` would fail for a cell. Empty if it would not.
+
+        Called before the launch.
+        """
 
     @classmethod
     @abstractmethod
     def takes(cls, interface: Interface) -> bool:
-        """Return whether the drives have an interface: `rack check` refuses a config that names
-        another.
+        """Return True if the drives have an interface.
+
+        `rack check` refuses a config that names another one.
         """
 
     @abstractmethod
     def brake(self) -> None:
-        """Engage the brakes: they stop and hold the joints, motors give no torque, the gripper
-        keeps its force.
+        """Engage the brakes, which stop and hold the joints.
+
+        The motors give no torque, and the gripper keeps its force.
         """
 
     @abstractmethod
     def step(self, ticks: int) -> None:
-        """Let `ticks` ticks pass: advance `tick` and `waited` (all that hardware does), and keep to
-        `patience`.
+        """Let time pass: advance `tick` and `waited`, and engage the brakes after `patience`.
 
-        `ticks` exceeds the level's cycle after missed cycles, and may be 0.
+        For hardware this is all. `ticks` exceeds the level's cycle after missed cycles, and may be
+        0.
         """
 
     @abstractmethod
     def report_waiting(self) -> None:
-        """Add to the findings that the arm has engaged its brakes by itself, between two cycles."""
+        """Report a finding if the arm has engaged its brakes by itself since the last cycle."""
 
     @abstractmethod
     def enable(self) -> None:
-        """Ask the drives for torque; does not block: `state` becomes ENABLED in a later `step`.
+        """Request that the drives be enabled, without blocking.
 
-        Until then, and whenever the arm is not enabled, it is braked in every cycle.
+        `state` becomes ENABLED in a later `step`. Until then, and whenever the arm is not enabled,
+        it is braked in every cycle.
         """
 
     @abstractmethod
     def disable(self) -> None:
-        """Ask the drives to give no torque any more."""
+        """Request that the drives be disabled."""
 
     @abstractmethod
     def reset(self) -> None:
-        """Ask drives in FAULT to leave it, for DISABLED, and clear `fault`, which says why they
-        were in it.
-        """
+        """Request that drives in FAULT change to DISABLED, and clear `fault`."""
 
     @abstractmethod
     def named(self, contact: tuple[int, int]) -> str:
-        """Return a `contact` in words."""
+        """Describe a `contact` as text."""
 
     @abstractmethod
     def feel(self) -> Array | None:
-        """Return the newest sample of the wrist sensor, (6,), N, N m, in its frame. None: it has
-        none.
+        """Return the newest sample of the wrist sensor, (6,), N and N m, in its frame.
+
+        None if the arm has none.
         """
 
     @abstractmethod
     def look(self, scene: Scene) -> None:
-        """Fill a `SCENE` with the poses of bodies and tool."""
+        """Fill a `Scene` with the poses of bodies and tool."""
 
     @abstractmethod
     def save(self, state: ArmState) -> None:
-        """Fill an `ARM_STATE` with the state that a restarted board needs."""
+        """Fill an `ArmState` with the state that a restarted board needs."""
 
     @abstractmethod
     def restore(self, state: ArmState) -> None:
-        """Continue from an `ARM_STATE`: called once, before the first `step`, on a restarted
-        board.
+        """Continue from an `ArmState`.
+
+        Called once on a restarted board, before the first `step`.
         """
 
 
 def find_arm(reference: str) -> type[DrivableArm]:
-    """Return the class that "package.module:Class" names. Raises `ValueError` where it is missing
-    or no whole arm.
+    """Return the class that "package.module:Class" names.
+
+    Raises:
+        ValueError: The class is missing, abstract, or no arm.
     """
     return named_class(reference, DrivableArm)

@@ -1,7 +1,6 @@
-"""The link between the servo level and its arm, with faults injected into samples, torques and
-motors.
+"""Link between the servo level and its arm that injects faults into samples, commands and motors.
 
-The steps that act the faults are in `rack.levels.fault_steps`.
+The steps that carry out the faults are in `rack.levels.fault_steps`.
 """
 
 from __future__ import annotations
@@ -19,16 +18,16 @@ from rack.levels.robot.dynamics import FRICTION_SPEED
 from rack.levels.robot.limits import MAX_CONTACT_PART, MAX_RESTING_CONTACT_PART, MIN_TURNING_JOINTS
 
 SLIGHT = 0.02
-"""Part of its torque limit that a motor must lack to count, in addition to what friction and a
-contact may hide."""
+"""Fraction of its torque limit that a motor must lack for the fault to be detectable.
+
+This is in addition to the torque that friction and a contact may hide.
+"""
 TURNS_FROM = 5.0 * FRICTION_SPEED
-"""Velocity, rad/s, above which the dry friction of a joint is known."""
+"""Velocity above which the direction of dry friction in a joint is known, rad/s."""
 
 
 class FaultyLink:
-    """Implements `Link` with injected faults. `acted` collects those that act, for
-    `Executor.acted`.
-    """
+    """Implements `Link` with injected faults."""
 
     def __init__(
         self,
@@ -37,8 +36,13 @@ class FaultyLink:
         link: Link | None = None,
         holds: Callable[[], bool] = bool,
     ) -> None:
-        """Connect the servo level to an arm; by its `link`, if it has one of its own. `holds`:
-        whether the gripper holds a part, for all that the level knows.
+        """Connect the servo level to an arm.
+
+        Args:
+            arm: The arm.
+            acted: Collects the faults that have an effect, for `Executor.acted`.
+            link: Link to the arm. None if the arm is driven directly.
+            holds: Returns True if the gripper may hold an object, as far as the level knows.
         """
         cell = arm.cell
         self._arm = arm
@@ -46,20 +50,19 @@ class FaultyLink:
         self._next: Link = link or arm
         self._acted = acted
         self._limits = limits = cell.bounds.torque
-        # Friction that helped may now resist: it hides twice its value.
+        # Friction may change from helping to resisting, and so hide twice its value.
         self._hidden = SLIGHT * limits + 2.0 * cell.model.dof_frictionloss[cell.dof]
-        # A contact that pushed along may now push back.
+        # A contact may change from pushing along to pushing back.
         self._pressed = 2.0 * MAX_CONTACT_PART * limits
         self._sensors: list[tuple[SensorStep, ActiveFault]] = []
-        self._motors: list[
-            tuple[float, ActiveFault]
-        ] = []  # with the part of its torque limit that a motor still gives
+        # With the fraction of its torque limit that a motor still provides.
+        self._motors: list[tuple[float, ActiveFault]] = []
         self._commands: list[tuple[CommandStep, ActiveFault]] = []
         self._kept: dict[Key, Sensed] = {}
         self._torque = np.zeros(len(limits))
 
     def inject(self, faults: Sequence[Fault]) -> None:
-        """Replace the active faults; one of a joint that the arm lacks has no effect."""
+        """Replace the active faults. Faults of joints that the arm lacks have no effect."""
         active = [
             ActiveFault(place, fault, joints, self._arm.every, self._kept)
             for place, fault in enumerate(faults)
@@ -71,12 +74,13 @@ class FaultyLink:
         self._sensors = [(step, a) for step, a in steps if isinstance(step, SensorStep)]
         self._motors = [(step.part(a), a) for step, a in steps if isinstance(step, MotorStep)]
         self._commands = [(step, a) for step, a in steps if isinstance(step, CommandStep)]
-        most = np.full(len(self._limits), np.inf)
-        for part, weak in self._motors:
-            np.minimum(most, part * self._limits, out=most, where=weak.joints)
-        self._arm.weaken(most if self._motors else None)
+        max_torque = np.full(len(self._limits), np.inf)
+        for fraction, weak in self._motors:
+            np.minimum(max_torque, fraction * self._limits, out=max_torque, where=weak.joints)
+        self._arm.weaken(max_torque if self._motors else None)
 
     def _joints(self, fault: Fault) -> Mask:
+        """Return a mask of the joints that a fault affects, (joints,)."""
         joints = np.arange(len(self._limits))
         return np.asarray((joints == fault.joint) | (fault.joint < 0))
 
@@ -93,30 +97,30 @@ class FaultyLink:
         """Pass on torques with the faults applied."""
         if self._commands:
             torque = self._corrupt(torque)
-        found = self._next.drive(torque, grip_force)
+        finding = self._next.drive(torque, grip_force)
         self._show_motors()
-        return found
+        return finding
 
     def follow(self, target: JointTarget, grip_force: float) -> Finding | None:
-        """Pass on set points with the faults applied: those of commands to the torque predicted."""
+        """Pass on set points, with command faults applied to the predicted torque."""
         if self._commands:
             target = target._replace(torque=self._corrupt(target.torque))
-        found = self._next.follow(target, grip_force)
+        finding = self._next.follow(target, grip_force)
         self._show_motors()
-        return found
+        return finding
 
     def _show_motors(self) -> None:
-        """Say which faults of motors have acted, and whether they show."""
+        """Record which motor faults had an effect, and whether it was detectable."""
         if self._motors and not self._arm.braked:
             asked = np.abs(self._arm.torque)
             hidden = self._hidden + self._pushed()
-            for part, active in self._motors:
-                missing = (asked - part * self._limits)[active.joints]
+            for fraction, active in self._motors:
+                missing = (asked - fraction * self._limits)[active.joints]
                 if (missing > 0.0).any():
                     self._acted[active.place] = bool((missing > hidden[active.joints]).any())
 
     def _pushed(self) -> Array | float:
-        """Return how much of a motor's missing torque a push may hide, N m."""
+        """Return how much of a motor's missing torque a contact may hide, N m."""
         if self._arm.leans:
             return self._pressed
         turning = np.count_nonzero(np.abs(self._arm.sense().velocity) > TURNS_FROM)
@@ -127,6 +131,7 @@ class FaultyLink:
         )
 
     def _corrupt(self, torque: Array) -> Array:
+        """Return the torques as the active command faults corrupt them, (joints,), N m."""
         corrupt = self._torque
         np.copyto(corrupt, torque)
         for step, active in self._commands:

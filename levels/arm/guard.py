@@ -1,6 +1,4 @@
-"""What an arm that does not keep its limits by itself is driven through: its samples are judged,
-and torques cut by them.
-"""
+"""Guard of an arm that does not keep its limits itself: judges samples and limits commands."""
 
 from __future__ import annotations
 
@@ -20,47 +18,59 @@ from rack.levels.robot.dynamics import Dynamics
 from rack.levels.robot.limits import Bounds
 
 
-def kept_bounds(cell: Cell, part: float) -> Bounds:
-    """Return the bounds of a cell, velocities by `part`, less what samples may be off by. Raises
-    `RobotError` for encoders too coarse to tell a limit.
+def kept_bounds(cell: Cell, speed_fraction: float) -> Bounds:
+    """Return the bounds of a cell, narrowed by the error of the encoders.
+
+    `speed_fraction` is the fraction of their limits below which velocities are kept.
+
+    Raises:
+        RobotError: The encoders are too coarse to detect a violated limit.
     """
-    velocity = part * cell.bounds.velocity
+    velocity = speed_fraction * cell.bounds.velocity
     off = cell.encoders.off
     speed_off = cell.encoders.speed_off
-    kept = Bounds(
+    bounds = Bounds(
         position=cell.bounds.position + np.stack((off, -off), axis=1),
         velocity=velocity - speed_off,
         torque=cell.bounds.torque,
     )
-    coarse = (kept.velocity <= speed_off) | (kept.position[:, 0] >= kept.position[:, 1])
+    coarse = (bounds.velocity <= speed_off) | (bounds.position[:, 0] >= bounds.position[:, 1])
     if coarse.any():
         joint = int(coarse.argmax())
         name = "latency_ticks" if cell.encoders.latency_ticks else "sensors"
         raise RobotError(
             f"robot.{name}: '{cell.joints[joint]}' may be off by {off[joint]:g} rad,"
-            f" {speed_off[joint]:g} rad/s: too coarse to keep it below"
-            f" {velocity[joint]:g} rad/s; permitted: less than half of that"
+            f" {speed_off[joint]:g} rad/s, which is too coarse to keep it below"
+            f" {velocity[joint]:g} rad/s; it must be less than half of that"
         )
-    return kept
+    return bounds
 
 
 class GuardedArm:
-    """Implements `Link` around an arm, by its samples alone.
+    """Implements `Link` around an arm, and protects it by its samples alone.
 
-    A torque that is not finite, or beyond its limit, is refused and engages the brakes. Others are
-    cut so that the arm stays within the limits, at a state from which it can still be stopped
-    (`LimitGate`), for as long as the motors would keep them: for the arm's patience, as later
-    cycles may be missed. The largest error that the encoders may have is kept as a margin on each
-    limit. A sample beyond a limit by more than that error, or not finite, is a violation: it is
-    counted, shows in the arm's `exceeded`, and nothing is driven on it. What only a simulation
-    knows, contacts and the truth, is not judged here.
+    A torque that is not finite, or beyond its limit, is refused and engages the brakes. Other
+    torques are cut so that the arm stays within the limits, and can still be stopped (`LimitGate`).
+    This holds for as long as the motors keep a torque, which is the arm's patience, as later cycles
+    may be missed. The largest possible error of the encoders is kept as a margin on each limit. A
+    sample that exceeds a limit by more than that error, or is not finite, is a violation. It is
+    counted, stored in the arm's `exceeded`, and stops the arm. Contacts and true positions, which
+    only a simulation knows, are not judged.
     """
 
     def __init__(
-        self, arm: BrakedArm, tick_s: float, below: Link | None = None, part: float = 1.0
+        self, arm: BrakedArm, tick_s: float, below: Link | None = None, speed_fraction: float = 1.0
     ) -> None:
-        """Guard an arm, sensed by the link `below`, if it has one of its own. Raises `RobotError`
-        for encoders too coarse to tell a limit, velocities by `part`.
+        """Guard an arm.
+
+        Args:
+            arm: The arm.
+            tick_s: Duration of a tick, s.
+            below: Link that senses the arm. None if the arm is sensed directly.
+            speed_fraction: Fraction of their limits below which velocities are kept.
+
+        Raises:
+            RobotError: The encoders are too coarse to detect a violated limit.
         """
         self._arm = arm
         self._below: Link = below or arm
@@ -70,23 +80,27 @@ class GuardedArm:
         self._last_set_point: Array = np.full((2, len(cell.dof)), np.nan)
         self._dynamics = Dynamics(cell)
         self._state: Sensed | None = None
-        self.permit(part)
+        self.permit(speed_fraction)
 
-    def permit(self, part: float) -> None:
-        """Keep velocities within `part` of their limits. Raises `RobotError`."""
+    def permit(self, speed_fraction: float) -> None:
+        """Keep velocities within `speed_fraction` of their limits.
+
+        Raises:
+            RobotError: The encoders are too coarse to detect a violated limit.
+        """
         cell = self._cell
-        kept = kept_bounds(cell, part)
+        bounds = kept_bounds(cell, speed_fraction)
         off = cell.encoders.off
         self._low = cell.bounds.position[:, 0] - off
         self._high = cell.bounds.position[:, 1] + off
-        self._fastest = part * cell.bounds.velocity + cell.encoders.speed_off
-        self._gate = LimitGate(kept, cell.limits.acceleration, self._span_s, self._dynamics)
+        self._fastest = speed_fraction * cell.bounds.velocity + cell.encoders.speed_off
+        self._gate = LimitGate(bounds, cell.limits.acceleration, self._span_s, self._dynamics)
         if cell.interface != "torque":
             last = self._last_set_point
-            self._set_points = SetPointGate(self._arm, kept, self._tick_s, self._span_s, last)
+            self._set_points = SetPointGate(self._arm, bounds, self._tick_s, self._span_s, last)
 
     def sense(self) -> Sensed:
-        """Return the newest sample, judged."""
+        """Return the newest sample, after judging it."""
         if isinstance(self._below, PresentLink):
             _, state, sample = self._below.look()
         else:
@@ -98,13 +112,13 @@ class GuardedArm:
         return sample
 
     def drive(self, torque: Array, grip_force: float) -> Finding | None:
-        """Pass on the torque, (joints,), N m, cut to what the limits permit; see `Link.drive`."""
+        """Pass on the torque, (joints,), N m, cut to the limits; see `Link.drive`."""
         arm = self._arm
         if (refused := arm.refused(torque)) is not None:
             arm.brake()
             return refused
         state = self._state
-        assert state is not None, "it is sensed before it is driven"
+        assert state is not None, "the arm is sensed before it is driven"
         if arm.exceeded is not None:
             arm.brake()
             return arm.exceeded.finding
@@ -113,36 +127,41 @@ class GuardedArm:
         return arm.drive(torque, grip_force)
 
     def follow(self, target: JointTarget, grip_force: float) -> Finding | None:
-        """Pass on the set points, as the limits permit them (`SetPointGate`); see `Link.follow`."""
+        """Pass on the set points, cut to the limits by `SetPointGate`; see `Link.follow`."""
         if self._arm.exceeded is not None:
             self._arm.brake()
             return self._arm.exceeded.finding
         state = self._state
-        assert state is not None, "it is sensed before it is driven"
+        assert state is not None, "the arm is sensed before it is driven"
         passed = self._set_points.admit(target, state.position, state.velocity)
         return passed if isinstance(passed, Finding) else self._below.follow(passed, grip_force)
 
     def _judge(self, sample: Sensed) -> None:
+        """Set the arm's `exceeded` to the limit that a sample exceeds, or to None.
+
+        A violation while the drives are enabled is counted and reported.
+        """
         q = sample.position
-        # NaN is not within limits either.
-        far = ~((q >= self._low) & (q <= self._high))
-        fast = ~(np.abs(sample.velocity) <= self._fastest)
-        if not (far.any() or fast.any()):
+        # The conditions are negated so that NaN counts as a violation.
+        is_outside = ~((q >= self._low) & (q <= self._high))
+        is_too_fast = ~(np.abs(sample.velocity) <= self._fastest)
+        if not (is_outside.any() or is_too_fast.any()):
             self._arm.exceeded = None
             return
-        joint = int((far | fast).argmax())
-        if far[joint]:
+        joint = int((is_outside | is_too_fast).argmax())
+        if is_outside[joint]:
             value = float(q[joint])
             permitted = f"{self._low[joint]:g} to {self._high[joint]:g} rad"
-            what = f"position {value:.4g} rad"
+            quantity = f"position {value:.4g} rad"
         else:
             value = float(sample.velocity[joint])
             permitted = f"up to {self._fastest[joint]:g} rad/s"
-            what = f"velocity {value:.4g} rad/s"
-        text = f"{what} of joint '{self._cell.joints[joint]}' as sensed; permitted: {permitted}"
+            quantity = f"velocity {value:.4g} rad/s"
+        text = f"{quantity} of joint '{self._cell.joints[joint]}' as sensed; permitted: {permitted}"
         arm = self._arm
         finding = Finding(Alarm.LIMIT_EXCEEDED, joint, value)
-        if arm.state is DriveState.ENABLED:  # before that it is moved by others
+        # An arm whose drives are not enabled may be moved by hand.
+        if arm.state is DriveState.ENABLED:
             arm.violations += 1
             arm.first_violation = arm.first_violation or f"{text}, at tick {sample.tick}"
             arm.find(finding)

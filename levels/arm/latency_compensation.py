@@ -1,5 +1,7 @@
-"""Samples of an arm behind a bus are some ticks old, and count from elsewhere: its equation of
-motion brings them to the present, `robot.calibration.offset` to the model's positions.
+"""Conversion of delayed samples to the present state of the arm.
+
+Samples of an arm behind a bus are some ticks old. The arm's equation of motion extrapolates them to
+the present. `robot.calibration.offset` converts them to positions of the model.
 """
 
 from __future__ import annotations
@@ -17,36 +19,35 @@ from rack.levels.robot.dynamics import Dynamics
 
 
 class Driven(NamedTuple):
-    """What has driven an arm until a tick."""
+    """Torque that has driven an arm until a tick."""
 
     until: int
-    torque: Array | None  # (joints,), N m; None: its brakes were engaged
+    torque: Array | None  # (joints,), N m. None if its brakes were engaged
 
 
 class Present(NamedTuple):
-    """A sample, and what it says of the present."""
+    """A sample and the present state derived from it."""
 
     sample: Sensed  # as sensed
-    state: Sensed  # as the model leads it on
-    shown: (
-        Sensed  # the same, but a joint whose sample has not changed stays: its sensor may be stuck
-    )
+    state: Sensed  # extrapolated to the present
+    # Like `state`, but a joint whose sample has not changed stays, because its sensor may be stuck.
+    shown: Sensed
 
 
 def present_link(arm: BrakedArm, tick_s: float) -> Link:
-    """Return the link to an arm through which samples are of the present: the arm, if they are."""
+    """Return a link whose samples are of the present. This is the arm if its samples are."""
     encoders = arm.cell.encoders
     is_present = encoders.offset is None and not encoders.latency_ticks
     return arm if is_present else PresentLink(arm, tick_s)
 
 
 class PresentLink:
-    """Implements `Link` around an arm whose samples are up to `robot.latency_ticks` old, and off by
-    `robot.calibration.offset`.
+    """Implements `Link` around an arm with delayed samples or an offset of positions.
 
-    Such a sample is led to the tick at which it is read: by the torques given since, or as brakes
-    stop a joint. How far off the model may be by then is in the cell's `encoders`. An older sample
-    is passed on as it is.
+    Samples are up to `robot.latency_ticks` old, and `robot.calibration.offset` is added to them. A
+    sample is extrapolated to the tick at which it is read, by the torques given since, or by the
+    deceleration of the brakes. The possible error of this is in the cell's `encoders`. A sample
+    that is older than the latency is passed on unchanged.
     """
 
     def __init__(self, arm: BrakedArm, tick_s: float) -> None:
@@ -61,7 +62,7 @@ class PresentLink:
         self._last: Present | None = None
 
     def sense(self) -> Sensed:
-        """Return the newest sample, brought to the present."""
+        """Return the newest sample, extrapolated to the present."""
         return self.look().shown
 
     def look(self) -> Present:
@@ -78,11 +79,11 @@ class PresentLink:
             return self._last
         state = shown = self._led(sample)
         if last is not None and sample.tick != last.sample.tick:
-            kept = sample.position == last.sample.position
-            kept &= sample.velocity == last.sample.velocity
+            is_stuck = sample.position == last.sample.position
+            is_stuck &= sample.velocity == last.sample.velocity
             shown = state._replace(
-                position=np.where(kept, last.shown.position, state.position),
-                velocity=np.where(kept, last.shown.velocity, state.velocity),
+                position=np.where(is_stuck, last.shown.position, state.position),
+                velocity=np.where(is_stuck, last.shown.velocity, state.velocity),
             )
         self._last = Present(sample, state, shown)
         return self._last
@@ -92,13 +93,13 @@ class PresentLink:
         return self._arm.drive(torque, grip_force)
 
     def follow(self, target: JointTarget, grip_force: float) -> Finding | None:
-        """Pass on the set points, as the drives count positions; see `Link.follow`."""
+        """Pass on the set points, converted to the drives' positions; see `Link.follow`."""
         if self._offset is not None:
             target = target._replace(position=target.position - self._offset)
         return self._arm.follow(target, grip_force)
 
     def _led(self, sample: Sensed) -> Sensed:
-        """Return a sample led to the present."""
+        """Return a sample extrapolated to the present."""
         led = copied(sample)._replace(tick=self._arm.tick)
         begun = sample.tick
         for until, torque in self._driven:
@@ -108,7 +109,14 @@ class PresentLink:
         return led
 
     def _pass(self, position: Array, velocity: Array, torque: Array | None, time_s: float) -> None:
-        """Let time pass for a state."""
+        """Advance a state by `time_s`, in place.
+
+        Args:
+            position: (joints,), rad.
+            velocity: (joints,), rad/s.
+            torque: (joints,), N m. None while the brakes were engaged.
+            time_s: Time, s.
+        """
         if torque is None:
             change = -np.copysign(np.minimum(np.abs(velocity), time_s * self._braking), velocity)
         else:

@@ -1,4 +1,4 @@
-"""Whatever a board drives, arm or hand: its time, its counters, and the messages that they fill."""
+"""Base class of an arm or hand that a board drives: time, counters and messages."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from rack.levels.messages import ArmState, Error, Scene
 from rack.levels.robot.cell import Cell
 
 EPISODE_TICKS = 20
-"""Ticks without a finding of a kind after which the next one is reported again."""
+"""Ticks without a finding of a kind after which the next one is reported as new."""
 SAVED = ("waited", "braked", "clipped", "touches", "violations", "pushed", "struck")
-"""Attributes of a plant that its `ArmState` keeps, and that seldom change."""
+"""Attributes of a plant that its `ArmState` contains, and that seldom change."""
 read_saved = attrgetter(*SAVED)
 
 
 class Plant:
-    """Time, counters and state of a driven mechanism in a cell; `ArmState` and `Scene` are filled
-    from them.
+    """Time, counters and state of a driven mechanism in a cell.
 
-    Its `findings` are those of the level that makes it: they reach the board, and the counters the
-    state, even if the level reports nothing.
+    It fills `ArmState` and `Scene` messages. It shares `findings` with the executor that constructs
+    it. Findings therefore reach the board, and counters the state, even if the level reports
+    nothing.
     """
 
     def __init__(self, cell: Cell) -> None:
@@ -32,48 +32,46 @@ class Plant:
         if Executor.made_last is not None:
             self.findings = Executor.made_last.findings
             Executor.made_last.complete_cycle.append(self.complete_cycle)
-        self._found_ticks: dict[Alarm, int] = {}  # of the last finding of each kind
-        self._reported_tick = -1  # of the last cycle that was reported
-        self.tick = 0  # tick of the state
+        self._found_ticks: dict[Alarm, int] = {}  # last finding of each kind
+        self._reported_tick = -1  # last cycle that was reported
+        self.tick = 0  # present tick
         self.waited = 0  # ticks since the last command
-        # held without commands: the brakes of an arm are engaged, the valves of a hand closed
+        # True while it is held without commands: by the brakes of an arm, or the valves of a hand.
         self.braked = True
-        self.fault = ""  # why it has failed and moves no more; empty: it has not
+        self.fault = ""  # why it has failed and cannot move. Empty if it has not
         self.clipped = 0  # cycles in which a command was refused or cut
-        self.brake_cause: int = Error.NONE  # of brakes that engage in this cycle: see their alarm
-        self.contact: tuple[int, int] | None = (
-            None  # geoms of an unintended contact, of it or its load, in a step
-        )
+        self.brake_cause: int = Error.NONE  # cause if brakes engage in this cycle
+        # Geoms of an unintended contact of the mechanism or its load in a step.
+        self.contact: tuple[int, int] | None = None
         self.touches = 0  # unintended contacts so far
-        self.first_touch = ""  # the first of them, readable: which geoms, and when
-        self.violations = (
-            0  # steps in which the drives broke a limit of position, velocity or torque
-        )
-        self.struck = 0  # ticks for which the motion is still blamed on a blow
-        self.pushed = (
-            0  # steps in which a blow pushed a joint beyond a limit of position or velocity
-        )
-        # the first violation, readable: which limit, by how much, and when
-        self.first_violation = ""
-        self._saved: tuple[ArmState, object] | None = None  # last state filled, with these
+        self.first_touch = ""  # description of the first unintended contact
+        # Steps in which the drives broke a limit of position, velocity or torque.
+        self.violations = 0
+        self.struck = 0  # ticks for which the motion is still attributed to a blow
+        # Steps in which a blow pushed a joint beyond a limit of position or velocity.
+        self.pushed = 0
+        self.first_violation = ""  # description of the first violation
+        self._saved: tuple[ArmState, object] | None = None  # last state filled, and its values
         self._model = cell.model
         self._data = cell.start()
 
     def _show(self, scene: Scene) -> None:
-        """Fill a `SCENE` from `_data`."""
+        """Fill a `Scene` from `_data`."""
         data = self._data
         bodies = self.cell.bodies
         tool = self.cell.tool
-        mujoco.mj_kinematics(self._model, data)  # after a step, poses are those before it
+        # After a step, MuJoCo's poses are still those before it.
+        mujoco.mj_kinematics(self._model, data)
         scene.position[: len(bodies)] = data.xpos[bodies]
         scene.quaternion[: len(bodies)] = data.xquat[bodies]
         scene.tool_position = data.site_xpos[tool]
         mujoco.mju_mat2Quat(scene.tool_quaternion, data.site_xmat[tool])
 
     def save(self, state: ArmState) -> None:
-        """Fill an `ARM_STATE` with the state that a restarted board needs. Default: the attributes.
+        """Fill an `ArmState` with the state that a restarted board needs.
 
-        A simulation adds its state: `state.state` has room for it, see `rack.levels.robot.engine`.
+        By default these are the attributes in `SAVED_ATTRIBUTES`. A simulation adds its state to
+        `state.state`, see `rack.levels.robot.engine`.
         """
         self.report_cycle()
         state.tick = self.tick
@@ -84,33 +82,37 @@ class Plant:
                 setattr(state, name, getattr(self, name))
 
     def find(self, finding: Finding) -> None:
-        """Add a finding, unless it continues an episode."""
+        """Report a finding, unless it continues an episode."""
         last = self._found_ticks.get(finding.alarm)
         if last is None or self.tick - last > EPISODE_TICKS:
             self.findings.append(finding)
         self._found_ticks[finding.alarm] = self.tick
 
     def refuse(self, finding: Finding) -> Finding:
-        """Count and report a command that must not be applied as it is; return why."""
+        """Count and report a refused command; return the finding."""
         self.clipped += 1
         self.find(finding)
         self.brake_cause = Error.LIMIT
         return finding
 
     def report_cycle(self) -> None:
-        """Add to the findings what a cycle did, at its end."""
+        """Report the events of a cycle, at its end."""
         self._reported_tick = self.tick
 
     def complete_cycle(self, state: ArmState | None) -> None:
-        """Report a cycle, and fill its `ARM_STATE`, unless the level has saved it."""
+        """Report a cycle and fill its `ArmState`, unless the level has already done it.
+
+        `state` is None if the level publishes no such message.
+        """
         if self._reported_tick != self.tick:
             if state is not None:
                 self.save(state)
             self.report_cycle()
 
     def restore(self, state: ArmState) -> None:
-        """Continue from an `ARM_STATE`: called once, before the first `step`, on a restarted
-        board.
+        """Continue from an `ArmState`.
+
+        Called once on a restarted board, before the first `step`.
         """
         self.tick = state.tick
         for name in SAVED:

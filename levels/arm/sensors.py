@@ -1,4 +1,4 @@
-"""Simulated sensors: encoders of finite resolution, and one of force and torque at the wrist."""
+"""Simulated sensors: encoders of finite resolution, and a force/torque sensor at the wrist."""
 
 from __future__ import annotations
 
@@ -15,16 +15,15 @@ from rack.levels.robot.wrist import Wrist
 
 AXES = 6
 STREAM = 0x57524953
-"""Added to the seed: the noise of the wrist sensor is not that of the encoders."""
+"""Added to the seed, so that the wrist sensor and the encoders have different noise."""
 
 
 class CoarseSensors:
-    """Samples positions and velocities of the joints: noise on the truth, then the nearest step of
-    the encoder.
+    """Simulated encoders, which add noise to the true state and round it to their resolution.
 
-    Velocities are the drive's, which times the encoder's edges: as coarse, and as noisy, as
-    positions over `EDGE_TIMING_S`. The noise of a tick is always the same, even on a restarted
-    board or when sampled twice.
+    Velocities come from the drive, which times the encoder's edges. Their resolution and noise
+    equal the values for positions divided by `EDGE_TIMING_S`. The noise of a tick is always the
+    same, even on a restarted board or when sampled twice.
     """
 
     def __init__(self, encoders: Encoders, seed: int) -> None:
@@ -33,20 +32,26 @@ class CoarseSensors:
         self._sense = sense_coarsely.load()
 
     def sample(self, position: Array, velocity: Array, tick: int) -> Array:
-        """Return (2, joints): positions, rad, and velocities, rad/s, of a tick as sensed."""
+        """Return the sensed positions, rad, and velocities, rad/s, (2, joints).
+
+        Args:
+            position: True positions, (joints,), rad.
+            velocity: True velocities, (joints,), rad/s.
+            tick: Tick of the sample, which determines the noise.
+        """
         sample = np.array((position, velocity))
         self._sense(sample, tick, *self._sensors)
         return sample
 
 
 class WristSensor:
-    """Samples the simulated wrist sensor: MuJoCo's numbers, noise, then the end of the range.
+    """Simulated wrist sensor, which adds noise to MuJoCo's values and clips them to its range.
 
-    It gives the force and torque between the flange and all that hangs on it: of a contact, of the
-    weight, and of the inertia. MuJoCo gives them as those of the parent on the child, in the frame
-    of the site: a tool at rest that nothing touches reads its weight upwards, and one that presses
-    down on a table reads less than that. The noise of a tick is always the same, even on a
-    restarted board or when sampled twice.
+    It measures force and torque between the flange and everything beyond it, due to contact, weight
+    and inertia. MuJoCo reports them as force and torque of the parent on the child, in the frame of
+    the site. A tool at rest that touches nothing reads its weight upwards, and a tool that presses
+    down on a table reads less. The noise of a tick is always the same, even on a restarted board or
+    when sampled twice.
     """
 
     def __init__(self, wrist: Wrist, data: mujoco.MjData, seed: int) -> None:
@@ -58,10 +63,12 @@ class WristSensor:
         self._sense = sense_coarsely.load()
 
     def sample(self, tick: int) -> Array:
-        """Return force, N, and torque, N m, in the sensor's frame, (6,), of the last step before
-        `tick`.
+        """Return force, N, and torque, N m, in the sensor's frame, (6,).
+
+        They are the values of the last step before `tick`.
         """
-        sample = np.zeros((2, AXES))  # of which the second row is not used
+        # The second row is not used.
+        sample = np.zeros((2, AXES))
         sample[0] = self._numbers[self._places]
         self._sense(sample, tick, *self._sensors)
         return np.asarray(np.clip(sample[0], -self._range, self._range))
@@ -69,13 +76,19 @@ class WristSensor:
 
 @compiled_for("f8[:,::1], i8, i8, f8[:,::1], f8[:,::1]")
 def sense_coarsely(sample: Array, tick: int, seed: int, noise: Array, step: Array) -> None:
-    """Add noise to a true `sample` (2, joints), of standard deviation `noise`, and round it to
-    multiples of `step`.
+    """Add noise to a true state and round it, in place.
+
+    Args:
+        sample: True state, (2, joints); receives the sample.
+        tick: Tick of the sample.
+        seed: Seed of the noise.
+        noise: Standard deviation, (2, joints).
+        step: Resolution, (2, joints). 0 where values are not rounded.
     """
     joints = sample.shape[1]
     chance = uniform(seed, tick, 2 * joints)
     for joint in range(joints):
-        # Box and Muller: two independent normal numbers from two uniform ones.
+        # Box and Muller's method makes two independent normal numbers from two uniform numbers.
         length = math.sqrt(-2.0 * math.log(chance[joint]))
         angle = 2.0 * math.pi * chance[joints + joint]
         sample[0, joint] += noise[0, joint] * length * math.cos(angle)
@@ -89,8 +102,14 @@ def sense_coarsely(sample: Array, tick: int, seed: int, noise: Array, step: Arra
 
 @compiled_for("i8, i8, i8")
 def uniform(seed: int, tick: int, count: int) -> Array:
-    """Return `count` random numbers between 0 and 1, neither included: a function of seed and tick
-    alone.
+    """Return random numbers between 0 and 1, both excluded.
+
+    They are a function of the arguments alone.
+
+    Args:
+        seed: Seed.
+        tick: Tick, for which the numbers are drawn.
+        count: How many numbers to return.
     """
     bits = mixed(np.zeros(count, dtype=np.uint64) + np.uint64(seed))
     bits = mixed(mixed(bits + np.uint64(tick)) + np.arange(count).astype(np.uint64))
@@ -99,7 +118,7 @@ def uniform(seed: int, tick: int, count: int) -> Array:
 
 @compiled
 def mixed(bits: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Return `bits` mixed as SplitMix64 does (Steele, Lea and Flood, OOPSLA 2014)."""
+    """Mix bits by SplitMix64 (Steele, Lea and Flood, OOPSLA 2014)."""
     bits = bits + np.uint64(0x9E3779B97F4A7C15)
     bits = (bits ^ (bits >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     bits = (bits ^ (bits >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)

@@ -24,23 +24,25 @@ from rack.levels.tables import SceneConfig, SensorConfig
 STANDSTILL = 0.01
 """Joint speed, rad/s, below which a joint holds its position."""
 BRAKE_BANDWIDTH = 20.0
-"""Of the hold by the brakes, rad/s."""
+"""Bandwidth of the position hold by the brakes, rad/s."""
 POSITION_GAIN = 25.0
 VELOCITY_GAIN = 100.0
 INTEGRAL_GAIN = 10.0
-"""Gains of a simulated drive, 1/s: speed per position error, acceleration per velocity error, and
-that of the integral. Each loop is at least twice as fast as the one around it, and all are slow
-against ticks of 2.5 ms."""
+"""Gains of a simulated drive, 1/s.
+
+They are speed per position error, acceleration per velocity error, and the integral gain. Each loop
+is at least twice as fast as the loop around it, and all are slow compared with ticks of 2.5 ms.
+"""
 
 
 class SimulatedArm(Simulation, Arm):
-    """Implements `Arm`: `substeps` MuJoCo steps a tick; simulated time is tick times period,
-    always.
+    """Implements `Arm` in MuJoCo, in `substeps` steps per tick.
 
-    Samples are as coarse and noisy as the cell's encoders; brakes and limit gate belong to the
-    drives and see the truth. A command is for one torque cycle. It passes the limit gate in every
-    tick, even in those that the servo level missed. Drives that follow set points
-    (`[robot] interface`) make a new torque in every tick; their state is in MuJoCo's user data.
+    Simulated time is always tick times period. Samples have the resolution and noise of the cell's
+    encoders. Brakes and limit gate belong to the drives and use the true state. A command is for
+    one torque cycle. It passes the limit gate in every tick, even if the servo level missed
+    it. Drives that follow set points (`[robot] interface`) compute a new torque in every tick.
+    Their state is in MuJoCo's user data.
     """
 
     keeps_limits = True
@@ -55,48 +57,49 @@ class SimulatedArm(Simulation, Arm):
         self.begin(scene, clock_ns)
         self._gripper = cell.gripper
         dynamics = self.dynamics
-        self._gate = LimitGate(cell.bounds, cell.limits.acceleration, clock_ns * 1e-9, dynamics)
-        self._rest: Array = cell.begin.copy()  # (joints,), rad: where brakes hold the joints
-        self._most: Array | None = None  # (joints,), N m: torques of weakened motors
+        tick_s = clock_ns * 1e-9
+        self._gate = LimitGate(cell.bounds, cell.limits.acceleration, tick_s, dynamics)
+        self._rest: Array = cell.begin.copy()  # (joints,), rad: held by the brakes
+        self._most: Array | None = None  # (joints,), N m: limits of weakened motors
         self._coarse = None if cell.encoders.exact else CoarseSensors(cell.encoders, seed)
         self._latency = cell.encoders.latency_ticks
-        # The newest, oldest first: all that are on their way.
+        # Samples that are delayed by the latency, oldest first.
         self._samples: deque[Sensed] = deque(maxlen=self._latency + 1)
         self._wrist = None if cell.wrist is None else WristSensor(cell.wrist, d, seed)
-        # N m: the command in force, and its torque as given.
+        # (joints,), N m: the command in force, and the torque applied for it.
         self._command, self.torque = np.zeros((2, joints))
-        self._given = False  # the command for the coming tick has passed the gate
-        self._drives: CascadedDrives | None = None  # None: they take torques
+        self._given = False  # True if the command for the coming tick has passed the gate
+        self._drives: CascadedDrives | None = None  # None if drives take torques
         if cell.interface != "torque":
-            tick_s = clock_ns * 1e-9
             rows = d.userdata[-SET_POINT_ROWS * joints :].reshape(SET_POINT_ROWS, joints)
             self._drives = CascadedDrives(cell, dynamics, tick_s, every, rows)
-            span_s = self.patience * tick_s
-            self._set_points = SetPointGate(self, cell.bounds, tick_s, span_s, rows[:2])
+            self._set_points = SetPointGate(
+                self, cell.bounds, tick_s, self.patience * tick_s, rows[:2]
+            )
             self.reports_torque = every == 1
-        if (
-            self._wrist is not None
-        ):  # until the first step it senses an arm that is braked, not one that falls
+        # Until the first step, the wrist sensor must sense a braked arm, not a falling one.
+        if self._wrist is not None:
             self._give()
             mujoco.mj_forward(cell.model, d)
 
     @property
     def holds(self) -> bool:
-        """Whether the gripper touches a part."""
+        """True if the gripper touches an object."""
         return bool(self._held().any())
 
     @property
     def leans(self) -> bool:
-        """Whether the arm, or its load, touches anything else."""
+        """True if the arm, or its load, touches anything else."""
         contact = self._data.contact
         one_sided = self._ours()[contact.geom].sum(axis=1) == 1
         return bool((one_sided & (contact.dist < 0.0)).any())
 
     def sense(self) -> Sensed:
-        """Return joint positions and velocities, rad, rad/s, and the gripper's, m, m/s."""
+        """Return the newest sample of the joints and the gripper."""
         return self._samples[0] if self._samples else self._sampled()
 
     def _sampled(self) -> Sensed:
+        """Return a sample of the present state, with the errors of the encoders."""
         position, velocity = self._state
         if self._coarse is not None:
             position, velocity = self._coarse.sample(position, velocity, self.tick)
@@ -110,8 +113,9 @@ class SimulatedArm(Simulation, Arm):
         return Sensed(position, velocity, opening, speed, self.tick)
 
     def drive(self, torque: Array, grip_force: float) -> Finding | None:
-        """Release the brakes and give torques and gripper force for the coming torque cycle; see
-        `Link.drive`.
+        """Release the brakes and apply torques and gripper force for the coming torque cycle.
+
+        See `Link.drive`.
         """
         self._grip(grip_force)
         finding = self.refused(torque)
@@ -123,9 +127,10 @@ class SimulatedArm(Simulation, Arm):
         return None
 
     def follow(self, target: JointTarget, grip_force: float) -> Finding | None:
-        """Release the brakes and follow, for the coming cycle; see `Link.follow`."""
+        """Release the brakes and follow a set point for the coming cycle; see `Link.follow`."""
         self._grip(grip_force)
-        if (offset := self.cell.encoders.offset) is not None:  # its encoders count from elsewhere
+        # The encoders measure from another origin.
+        if (offset := self.cell.encoders.offset) is not None:
             target = target._replace(position=target.position + offset)
         passed = self._set_points.admit(target, *self._state)
         if isinstance(passed, Finding):
@@ -136,34 +141,38 @@ class SimulatedArm(Simulation, Arm):
         return None
 
     def _release(self) -> None:
-        """Release the brakes, and let the motors give the command."""
+        """Release the brakes, and apply the command to the motors."""
         self.waited = 0
         self.braked = False
         self._give()
 
     def _grip(self, force: float) -> None:
+        """Set the force of the gripper, N, unless it is not finite."""
         if self._gripper is not None and math.isfinite(force):
             self._data.ctrl[self._gripper.actuator] = self.grip_force = force
 
     def brake(self) -> None:
-        """Engage the brakes; the motors give nothing, the gripper keeps its force."""
+        """Engage the brakes. The motors give no torque, and the gripper keeps its force."""
         self._engage()
         self._give()
 
     def _engage(self) -> None:
+        """Engage the brakes, and store the positions that they hold."""
         if not self.braked:
             self.braked = True
             np.copyto(self._rest, self._state[0])
 
     def weaken(self, most: Array | None) -> None:
-        """Limit the motors to `most` (joints,), N m, from the next command on; None: they are
-        sound.
+        """Limit the motor torques from the next command on.
+
+        `most` is (joints,), N m, or None for intact motors.
         """
         self._most = most
 
     def step(self, ticks: int) -> None:
-        """Simulate `ticks` ticks. After a fault the arm stands still in its last sound state; time
-        continues.
+        """Simulate `ticks` ticks.
+
+        After a fault the arm stands still in its last valid state, while time continues.
         """
         self.contact = None
         for _ in range(ticks):
@@ -183,18 +192,22 @@ class SimulatedArm(Simulation, Arm):
             self._data.time = self._now_s
 
     def feel(self) -> Array | None:
-        """Return the sample of the wrist sensor, (6,), N, N m: that of a substep ago, as MuJoCo's
-        are.
+        """Return the sample of the wrist sensor, (6,), N and N m.
+
+        It is one substep old, like all of MuJoCo's sensors.
         """
         return None if self._wrist is None else self._wrist.sample(self.tick)
 
     def save(self, state: ArmState) -> None:
-        """Fill an `ARM_STATE`."""
+        """Fill an `ArmState`, including the positions held by the brakes."""
         super().save(state)
         state.rest = self._rest
 
     def restore(self, state: ArmState) -> None:
-        """Continue, bit for bit, from an `ARM_STATE`; its last torques are the last command."""
+        """Continue, bit for bit, from an `ArmState`.
+
+        Its last torques become the last command.
+        """
         super().restore(state)
         d = self._data
         cell = self.cell
@@ -203,12 +216,13 @@ class SimulatedArm(Simulation, Arm):
         np.copyto(self.torque, self._command)
         if self._gripper is not None:
             self.grip_force = float(d.ctrl[self._gripper.actuator])
-        # Torques stay; of a set point that came before the last tick, drives make a new one.
+        # Torques stay in force. Drives compute a new torque for a set point before the last tick.
         self._given = self._drives is None or self.braked or self.waited == 0
 
     def _give(self) -> None:
-        """Apply the command to the motors, or the brakes' torque to the joints, through the limit
-        gate.
+        """Apply torques through the limit gate.
+
+        They are the command for the motors, or the torque of the brakes on the joints.
         """
         cell = self.cell
         braked = self.braked
@@ -223,36 +237,48 @@ class SimulatedArm(Simulation, Arm):
         self.clipped += cut
         self._data.qfrc_applied[cell.dof] = passed if braked else 0.0
         np.copyto(self.torque, 0.0 if braked else passed)
-        given = self.torque if self._most is None else np.clip(self.torque, -self._most, self._most)
-        self._data.ctrl[cell.actuators] = given
+        torque = self.torque
+        if self._most is not None:
+            torque = np.clip(torque, -self._most, self._most)
+        self._data.ctrl[cell.actuators] = torque
         self._given = True
 
     def _braking_torque(self, q: Array, qd: Array) -> Array:
-        """Return the torques (joints,), N m, that stop the joints, or hold them where they came to
-        rest, even with the motors off.
+        """Return the torques that stop the joints or hold them at rest, (joints,), N m.
+
+        The brakes apply them even with the motors off.
         """
-        most = self.cell.limits.acceleration
+        max_acceleration = self.cell.limits.acceleration
         np.copyto(self._rest, q, where=np.abs(qd) > STANDSTILL)
-        wanted = BRAKE_BANDWIDTH**2 * (self._rest - q) - 2.0 * BRAKE_BANDWIDTH * qd
+        wanted_acceleration = BRAKE_BANDWIDTH**2 * (self._rest - q) - 2.0 * BRAKE_BANDWIDTH * qd
         inertia, bias = self.dynamics.terms(q, qd)
-        return np.asarray(mat_vec(inertia, np.clip(wanted, -most, most)) + bias)
+        return np.asarray(
+            mat_vec(inertia, np.clip(wanted_acceleration, -max_acceleration, max_acceleration))
+            + bias
+        )
 
 
 class CascadedDrives:
-    """The drives of an arm, as position servos have them: P on position, around PI on velocity,
-    with limited torque.
+    """Position servos with cascaded loops: P on position around PI on velocity, limited in torque.
 
-    They know the arm's inertia, as the controllers of such arms do, or as gears make it the same
-    everywhere; with that of each joint at home the K-1607, which has no gears, swings. Gravity,
-    friction and load are left to the integral, which begins with the torque predicted as brakes are
-    released.
+    They know the arm's inertia, like controllers of such arms, or like arms whose gears make it
+    nearly constant. With the inertia of each joint at home instead, the K-1607, which has no gears,
+    swings. Gravity, friction and load are compensated by the integral, which starts from the
+    predicted torque when the brakes are released.
     """
 
     def __init__(
         self, cell: Cell, dynamics: Dynamics, tick_s: float, every: int, rows: Array
     ) -> None:
-        """Use `rows`, (3, joints): position, rad, and velocity, rad/s, for the end of a cycle, and
-        the torque of the integral, N m.
+        """Prepare the drives.
+
+        Args:
+            cell: The arm.
+            dynamics: Its equation of motion.
+            tick_s: Duration of a tick, s.
+            every: Length of a cycle, ticks.
+            rows: State of the drives, (3, joints): position, rad, and velocity, rad/s, at the end
+                of a cycle, and torque of the integral, N m.
         """
         self._rows = rows
         self._dynamics = dynamics
@@ -262,20 +288,31 @@ class CascadedDrives:
         self._position_gain = POSITION_GAIN if cell.interface == "position" else 0.0
 
     def start(self, torque: Array, q: Array, qd: Array) -> None:
-        """Begin at `q`, `qd` with what `torque`, (joints,), N m, contains beside acceleration."""
+        """Initialize the integral so that the drives continue without a step in torque.
+
+        Args:
+            torque: Predicted torque of the motion, (joints,), N m, of which the part for
+                acceleration is subtracted.
+            q: Positions, (joints,), rad.
+            qd: Velocities, (joints,), rad/s.
+        """
         change = (self._rows[1] - qd) / (self._every * self._tick_s)
         self._rows[2] = torque - mat_vec(self._dynamics.terms(q, qd).inertia, change)
 
     def torque(self, q: Array, qd: Array, waited: int) -> Array:
-        """Return the torques, (joints,), N m, of the tick that begins at `q`, `qd`, `waited` ticks
-        after the set point came.
+        """Return the torques of the coming tick, (joints,), N m.
+
+        Args:
+            q: Positions at its start, (joints,), rad.
+            qd: Velocities at its start, (joints,), rad/s.
+            waited: Ticks since the set point arrived.
         """
         position, velocity, integral = self._rows
-        now = position + (waited - self._every) * self._tick_s * velocity
-        slip = velocity + self._position_gain * (now - q) - qd
+        target = position + (waited - self._every) * self._tick_s * velocity
+        slip = velocity + self._position_gain * (target - q) - qd
         pull = VELOCITY_GAIN * mat_vec(self._dynamics.terms(q, qd).inertia, slip)
-        wanted = pull + integral
-        torque = np.asarray(np.clip(wanted, -self._limit, self._limit))
-        # A limit that is reached stops the integral.
-        integral += np.where(torque == wanted, INTEGRAL_GAIN * self._tick_s * pull, 0.0)
+        wanted_torque = pull + integral
+        torque = np.asarray(np.clip(wanted_torque, -self._limit, self._limit))
+        # The integral stops while the torque is limited, to avoid windup.
+        integral += np.where(torque == wanted_torque, INTEGRAL_GAIN * self._tick_s * pull, 0.0)
         return torque

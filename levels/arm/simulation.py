@@ -1,6 +1,4 @@
-"""The simulation of a cell: the ticks of a plant in MuJoCo, judged at every step, and what moves by
-itself in it.
-"""
+"""Simulation of a cell: the ticks of a plant in MuJoCo, checks of every step, moving obstacles."""
 
 from __future__ import annotations
 
@@ -23,39 +21,42 @@ from rack.levels.robot.lookup import geom_name
 from rack.levels.tables import MotionConfig, PushConfig, SceneConfig
 
 STRUCK_TICKS = 40
-"""Ticks after a contact, or after the last limit broken since, in which the motion is blamed on the
-blow."""
+"""Ticks for which the motion is attributed to a blow.
+
+They count from the contact, or from the last limit that was broken since.
+"""
 STEPS_AT_REST = 10
-"""Steps in which a body is slower than `sleep_tolerance` before it sleeps: MuJoCo's mjMINAWAKE."""
+"""Steps for which a body must be slower than `sleep_tolerance` before it sleeps.
+
+This is MuJoCo's mjMINAWAKE.
+"""
 QUANTITIES = (("position", "rad"), ("velocity", "rad/s"), ("torque", "N m"))
-"""What is judged of a joint, by row of a step."""
+"""Checked quantities of a joint, in the row order of a step."""
 
 
 class Simulation(Plant):
-    """A plant in MuJoCo: `substeps` steps a tick; simulated time is tick times period, always.
+    """A plant in MuJoCo, in `substeps` steps per tick. Simulated time is always tick times period.
 
-    Subclasses call `begin` when the plant is made, and give the drives their commands before each
-    `_simulate`.
+    Subclasses call `prepare_simulation` in their constructor, and give the drives their commands
+    before each `_simulate_tick`.
     """
 
     sleeps: ClassVar[bool] = True
-    """Whether its bodies may sleep: nothing but MuJoCo moves them."""
+    """True if bodies may sleep, because nothing except MuJoCo moves them."""
 
     def begin(self, scene: SceneConfig, clock_ns: int) -> None:
-        """Prepare the steps of a tick of `clock_ns`, and what judges them."""
+        """Prepare the steps of a tick and their checks. One tick is `clock_ns`."""
         cell = self.cell
         if self.sleeps:
             self._model = sleeping(cell.model, scene)
         self._clock_ns = clock_ns
         steps = round(clock_ns * 1e-9 / cell.model.opt.timestep)
         self._steps = substeps(cell, self._model, self._data, steps)
-        self._state = (
-            self._steps.seen[-1, 0],
-            self._steps.seen[-1, 1],
-        )  # (joints,): true positions and velocities
+        # True positions and velocities, (joints,) each.
+        self._state = (self._steps.seen[-1, 0], self._steps.seen[-1, 1])
         self._refresh()
         self._is_arm, self._is_gripper = np.zeros((2, cell.model.ngeom), dtype=bool)
-        self._is_arm[cell.arm_geoms] = self._is_gripper[cell.gripper_geoms] = True
+        self._is_arm[cell.geoms.arm] = self._is_gripper[cell.geoms.gripper] = True
         self._root = cell.model.body_rootid[cell.model.geom_bodyid]
         obstacles = zip(
             cell.mocap, cell.bodies[len(cell.object_qpos) :], scene.obstacles, strict=True
@@ -73,30 +74,31 @@ class Simulation(Plant):
         self._copy_state = copy_state.load()
 
     def _refresh(self) -> None:
-        """Take positions and velocities of the joints from MuJoCo's state, after it was set other
-        than by a step.
+        """Read positions and velocities of the joints from MuJoCo's data.
+
+        Necessary after the data was changed other than by a step.
         """
         position, velocity = self._state
         position[:] = self._data.qpos[self.cell.qpos]
         velocity[:] = self._data.qvel[self.cell.dof]
 
     def named(self, contact: tuple[int, int] | NDArray[np.int32]) -> str:
-        """Return a `contact` in words: the names of the geoms."""
+        """Describe a `contact` by the names of the geoms."""
         first, second = (geom_name(self.cell.model, geom) for geom in contact)
         return f"'{first}' touches '{second}'"
 
     def look(self, scene: Scene) -> None:
-        """Fill a `SCENE` with the poses as simulated."""
+        """Fill a `Scene` with the simulated poses."""
         self._show(scene)
 
     def save(self, state: ArmState) -> None:
-        """Fill an `ARM_STATE`."""
+        """Fill an `ArmState`, including the state of the simulation."""
         super().save(state)
         steps = self._steps
         self._copy_state(steps.model, steps.data, steps.asleep, state.state)
 
     def restore(self, state: ArmState) -> None:
-        """Continue, bit for bit, from an `ARM_STATE`."""
+        """Continue, bit for bit, from an `ArmState`."""
         super().restore(state)
         restore_state(self._model, self._data, state.state)
         self._refresh()
@@ -115,22 +117,23 @@ class Simulation(Plant):
             self._data.mocap_pos[mocap] = obstacle_position(start, moves, self._now_s)
         for body, pushes in self._pushes:
             self._data.xfrc_applied[body, :3] = push_force(pushes, self._now_s)
-        made = self._advance(0, self._after_s, *self._steps)
-        if made < 0:
-            self._look_closer(-made)
+        steps_made = self._advance(0, self._after_s, *self._steps)
+        if steps_made < 0:
+            self._look_closer(-steps_made)
         elif self.struck:
             self.struck -= 1
 
-    def _look_closer(self, made: int) -> None:
-        """Finish a tick in which step `made` failed a check; on a fault, restore the state before
-        the tick.
+    def _look_closer(self, steps_made: int) -> None:
+        """Finish a tick in which step `made` failed a check.
+
+        If the cause is a fault of the simulation, the state before the tick is restored.
         """
         touches = self.touches
         self._count_contacts()
-        while made < len(self._steps.seen):
-            made = self._advance(made, self._after_s, *self._steps)
-            if made < 0:
-                made = -made
+        while steps_made < len(self._steps.seen):
+            steps_made = self._advance(steps_made, self._after_s, *self._steps)
+            if steps_made < 0:
+                steps_made = -steps_made
                 self._count_contacts()
         if self.touches > touches and self.contact is not None:
             self.find(Finding(Alarm.COLLISION, *self.contact))
@@ -145,63 +148,64 @@ class Simulation(Plant):
         self._data.time = self._after_s
 
     def _count_contacts(self) -> None:
-        """Count the unintended contacts of the last step; keep one of the plant, or of its load."""
-        pairs = unintended_contacts(self._data, self.cell.touch)
+        """Count the unintended contacts of the last step, and store one of the arm or its load."""
+        pairs = unintended_contacts(self._data, self.cell.geoms.touch)
         if not len(pairs):
             return
         if not self.first_touch:
             named = self.named(pairs[0])
             self.first_touch = f"unintended contact: {named} at {self._data.time:.3f} s"
         self.touches += len(pairs)
-        ours = pairs[self._ours()[pairs].any(axis=1)]
-        if len(ours):
-            self.contact = int(ours[0, 0]), int(ours[0, 1])
+        own_pairs = pairs[self._ours()[pairs].any(axis=1)]
+        if len(own_pairs):
+            self.contact = int(own_pairs[0, 0]), int(own_pairs[0, 1])
 
     def _held(self) -> Mask:
-        """Mark (ngeom,) the geoms of free bodies that the gripper touches."""
+        """Return a mask of the geoms of free bodies that the gripper touches, (ngeom,)."""
         pairs = self._data.contact.geom
         others = pairs[self._is_gripper[pairs].any(axis=1)].ravel()
         roots = self._root[others[~self._is_arm[others]]]
         return np.asarray(np.isin(self._root, roots[roots != 0]))
 
     def _ours(self) -> Mask:
-        """Mark (ngeom,) the geoms of the arm and of its load."""
+        """Return a mask of the geoms of the arm and its load, (ngeom,)."""
         return np.asarray(self._is_arm | self._held())
 
     def _judge_limits(self) -> bool:
-        """Judge position, velocity and torque, of motor and brake together, in every step of a
-        tick; return whether one broke a limit.
+        """Check the joint limits in all steps of a tick; return True if one is broken.
 
-        It shares no code with the limit gate, which enforces the limits. A blow that still moves
-        the arm breaks those of position and velocity: no drive can prevent it.
+        Positions, velocities and torques (of motor and brake together) are checked. The check
+        shares no code with the limit gate, which enforces the limits. While a blow still moves the
+        arm, it may break limits of position and velocity, because no drive can prevent that.
         """
         seen = self._steps.seen
         low, high = self._steps.judged[:2]
-        wrong = ~((seen >= low) & (seen <= high))  # NaN is not within limits either
-        is_wrong = steps = wrong.any(axis=(1, 2))
+        # The condition is negated so that NaN counts as a violation.
+        violated = ~((seen >= low) & (seen <= high))
+        is_wrong = steps = violated.any(axis=(1, 2))
         if self.struck:
-            pushed = steps & ~wrong[:, 2].any(axis=1) & np.isfinite(seen).all(axis=(1, 2))
+            pushed = steps & ~violated[:, 2].any(axis=1) & np.isfinite(seen).all(axis=(1, 2))
             self.pushed += int(pushed.sum())
             steps = steps & ~pushed
         if steps.any():
             self.violations += int(steps.sum())
-            self._report_violation(wrong, int(steps.argmax()))
+            self._report_violation(violated, int(steps.argmax()))
         return bool(is_wrong.any())
 
-    def _report_violation(self, wrong: Mask, step: int) -> None:
-        """Report the first limit that a step broke."""
-        part, joint = (int(at[0]) for at in np.nonzero(wrong[step]))
-        value = float(self._steps.seen[step, part, joint])
+    def _report_violation(self, violated: Mask, step: int) -> None:
+        """Report the first limit that `step` broke."""
+        row, joint = (int(at[0]) for at in np.nonzero(violated[step]))
+        value = float(self._steps.seen[step, row, joint])
         if not self.first_violation:
-            what, unit = QUANTITIES[part]
+            quantity, unit = QUANTITIES[row]
             where = f"joint '{self.cell.joints[joint]}' at {self._now_s:.4f} s, step {step}"
-            low, high = self._steps.judged[:2, part, joint]
+            low, high = self._steps.judged[:2, row, joint]
             permitted = f"{low:g} to {high:g} is permitted"
-            self.first_violation = f"{what} {value:.6g} {unit} of {where}; {permitted}"
+            self.first_violation = f"{quantity} {value:.6g} {unit} of {where}; {permitted}"
         self.find(Finding(Alarm.LIMIT_EXCEEDED, joint, value))
 
     def _broken(self) -> str:
-        """Return the fault of the simulation; empty: none."""
+        """Return a description of the fault of the simulation. Empty if there is none."""
         d = self._data
         warned = np.flatnonzero(d.warning.number)
         if warned.size:
@@ -212,8 +216,14 @@ class Simulation(Plant):
 
 
 def obstacle_position(start: Array, moves: tuple[MotionConfig, ...], time_s: float) -> Array:
-    """Return the origin of an obstacle that starts at `start`, (3,), m, at simulated `time_s`; a
-    move that starts before the last one has ended cuts it short.
+    """Return the origin of a moving obstacle, (3,), m.
+
+    A move that starts before the previous one has ended cuts that one short.
+
+    Args:
+        start: Origin before the first move, (3,), m.
+        moves: Moves of the obstacle.
+        time_s: Simulated time, s.
     """
     ordered = sorted(moves, key=lambda move: move.at)
     ends = (*(later.at for later in ordered[1:]), np.inf)
@@ -221,54 +231,55 @@ def obstacle_position(start: Array, moves: tuple[MotionConfig, ...], time_s: flo
     for move, end in zip(ordered, ends, strict=False):
         if time_s <= move.at:
             break
-        way = np.array(move.to) - place
-        length = norm(way)
+        offset = np.array(move.to) - place
+        length = norm(offset)
         driven = move.speed * (min(time_s, end) - move.at)
-        place = np.array(move.to) if driven >= length else place + way * (driven / length)
+        place = np.array(move.to) if driven >= length else place + offset * (driven / length)
     return place
 
 
 def push_force(pushes: tuple[PushConfig, ...], time_s: float) -> Array:
-    """Return the sum of the pushes on an object, (3,), N, at simulated `time_s`."""
+    """Return the sum of the pushes on an object at simulated `time_s`, (3,), N."""
     total = np.zeros(3)
     for push in pushes:
-        since = time_s - push.at
-        left = push.at + push.seconds - time_s
-        if since >= 0.0 and left > 0.0:
+        elapsed_s = time_s - push.at
+        remaining_s = push.at + push.seconds - time_s
+        if elapsed_s >= 0.0 and remaining_s > 0.0:
             share = 1.0
             if push.rise > 0.0:
-                share = min(1.0, since / push.rise, left / push.rise)
+                share = min(1.0, elapsed_s / push.rise, remaining_s / push.rise)
             total += np.array(push.force) * share
     return total
 
 
 def sleeping(model: mujoco.MjModel, scene: SceneConfig) -> mujoco.MjModel:
-    """Return the model to step a simulation with: bodies at rest sleep where all that could move
-    them wakes them.
+    """Return a copy of the model in which bodies at rest sleep, if that is safe.
 
-    A mocap body that moves does not, and MuJoCo ends the process at tendon equalities and flexible
-    bodies that might sleep. Where steps are short, or gravity weak, a body would sleep in the air,
-    at the turning point of its flight. Only for whole steps: parts of one, called by themselves,
-    leave out what does not move.
+    It is not safe if a mocap body moves, because that does not wake others, nor with tendon
+    equalities and flexible bodies, because MuJoCo ends the process if these might sleep. Where
+    steps are short, or gravity is weak, a body would sleep in the air, at the turning point of its
+    flight. Use the model for whole steps only: parts of a step, called separately, leave out bodies
+    that do not move.
     """
-    found = copy(model)
-    option = found.opt
-    gained = STEPS_AT_REST * option.timestep * norm(option.gravity)  # m/s, in falling
+    result = copy(model)
+    option = result.opt
+    gained = STEPS_AT_REST * option.timestep * norm(option.gravity)  # m/s, by falling
     tendons = model.eq_type == mujoco.mjtEq.mjEQ_TENDON
-    lingers = gained < 4.0 * option.sleep_tolerance  # in the air, for longer than those steps
-    if not (lingers or scene.motion or tendons.any() or model.nflex):
+    # A body would be slow at the turning point of its flight for longer than those steps.
+    may_float = gained < 4.0 * option.sleep_tolerance
+    if not (may_float or scene.motion or tendons.any() or model.nflex):
         option.enableflags |= SLEEP
-    return found
+    return result
 
 
 def restore_state(model: mujoco.MjModel, data: mujoco.MjData, state: Array) -> None:
-    """Set `data` to a state, so that its next steps are those of the data that was saved."""
+    """Restore `data`, so that its next steps repeat the saved simulation bit for bit."""
     data.tree_asleep[:] = -1
     mj_update_sleep(model._address, data._address)
     view_state(model, data, state)
     asleep = state[state.size - model.ntree :]
     if (asleep >= 0).any():
-        # Steps no longer compute what belongs to sleeping bodies: here, once, while they are awake.
+        # Steps skip quantities of sleeping bodies, so compute them once while all are awake.
         mujoco.mj_forward(model, data)
         view_state(model, data, state)
     data.tree_asleep[:] = asleep

@@ -1,4 +1,4 @@
-"""The MuJoCo steps of one tick, in compiled code, and the judgement of each."""
+"""The MuJoCo steps of one tick, each checked against limits, in compiled code."""
 
 from __future__ import annotations
 
@@ -27,33 +27,40 @@ PHYSICS = int(mujoco.mjtState.mjSTATE_PHYSICS)
 
 
 class Substeps(NamedTuple):
-    """Further arguments of `advance`, prepared once: few, because each array costs more than the
-    arithmetic on it.
+    """Constant arguments of `make_steps`, prepared once.
+
+    They are few, because each array costs more than the arithmetic on it.
     """
 
     model: int  # address
     data: int  # address
-    places: NDArray[np.int64]  # (4, joints), in `memory`: of position, velocity, motor, brake
-    memory: Array  # MuJoCo's
-    # (2 + substeps, 3, joints): lowest, highest and, after each step, position, velocity, torque
+    places: NDArray[np.int64]  # (4, joints), index in `memory`: position, velocity, motor, brake
+    memory: Array  # memory of MuJoCo's data
+    # (2 + substeps, 3, joints): rows of position, velocity and torque. The first is the lowest
+    # permitted, the second the highest permitted; then one follows for each step.
     judged: Array
     asleep: NDArray[np.int32]  # (trees,), see `copy_state`
-    states: Array  # (2, state): before the tick; after it, as far as the steps change it
-    warnings: NDArray[np.int32]  # (kinds,), how often MuJoCo has raised each
-    contacts: NDArray[np.int32]  # (1,), their number
-    geoms: NDArray[np.int32]  # (room, 2), of the contacts
-    distance: Array  # (room,), m
+    states: Array  # (2, state): before the tick, and the part that steps change after it
+    warnings: NDArray[np.int32]  # (kinds,), count of MuJoCo's warnings
+    contacts: NDArray[np.int32]  # (1,), number of contacts
+    geoms: NDArray[np.int32]  # (capacity, 2), pairs of geoms in contact
+    distance: Array  # (capacity,), m
     touch: Mask  # (ngeom, ngeom), True where a contact is unintended
 
     @property
     def seen(self) -> Array:
-        """Position, velocity, torque after each step: (substeps, 3, joints)."""
+        """Position, velocity and torque after each step, (substeps, 3, joints)."""
         return self.judged[2:]
 
 
 def substeps(cell: Cell, model: mujoco.MjModel, data: mujoco.MjData, steps: int) -> Substeps:
-    """Return the arguments of `advance` for `data` of a cell, whose `model` makes `steps` steps a
-    tick.
+    """Prepare the arguments of `make_steps`.
+
+    Args:
+        cell: The cell.
+        model: The model that makes the steps.
+        data: The data of the simulation.
+        steps: Number of steps in a tick.
     """
     bounds = cell.bounds
     high = np.stack((bounds.position[:, 1], bounds.velocity, bounds.torque))
@@ -71,13 +78,20 @@ def substeps(cell: Cell, model: mujoco.MjModel, data: mujoco.MjData, steps: int)
         np.zeros((2, state_size(model))),
         data.warning.number,
         *contact_views(model, data),
-        cell.touch,
+        cell.geoms.touch,
     )
 
 
 @compiled_for("i8, i8, i4[::1], f8[::1]")
 def copy_state(model: int, data: int, asleep: NDArray[np.int32], state: Array) -> None:
-    """Fill `state`, (state_size,), of which `asleep`, MuJoCo's `tree_asleep`, is the end."""
+    """Fill a state of the simulation.
+
+    Args:
+        model: Address of the model.
+        data: Address of the data.
+        asleep: MuJoCo's `tree_asleep`, (trees,), which becomes the end of the state.
+        state: Receives the state, (state_size,).
+    """
     mj_get_state(model, data, state.ctypes.data, INTEGRATION)
     first = len(state) - len(asleep)
     for tree in range(len(asleep)):
@@ -104,38 +118,59 @@ def advance(  # noqa: PLR0913  # flat arguments: a field of a record takes 0.1 u
     distance: Array,
     touch: Mask,
 ) -> int:
-    """Make the steps of a tick from number `begin` on, up to one that needs a closer look; the tick
-    ends at `end_s`.
+    """Make the steps of a tick, up to a step that fails a check.
 
-    Returns the number of the step to continue with; negative if the last one made broke a limit, or
-    has an unintended contact, a warning, or a state that is not finite.
+    A step fails if it breaks a limit, or has an unintended contact, a warning, or a state that is
+    not finite. For the arguments from `model` on see `Substeps`.
+
+    Args:
+        begin: Number of the first step to make.
+        end_s: Simulated time at the end of the tick, s.
+        model: Address of the model.
+        data: Address of the data.
+        places: See `Substeps`.
+        memory: See `Substeps`.
+        judged: See `Substeps`.
+        asleep: See `Substeps`.
+        states: See `Substeps`.
+        warnings: See `Substeps`.
+        contacts: See `Substeps`.
+        geoms: See `Substeps`.
+        distance: See `Substeps`.
+        touch: See `Substeps`.
+
+    Returns:
+        The number of steps made in this tick. Negative if the last one failed a check.
     """
     before = states[0]
     after = states[1]
-    low = judged[0]
-    high = judged[1]
+    low, high = judged[:2]
     seen = judged[2:]
     if begin == 0:
         copy_state(model, data, asleep, before)
     for step in range(begin, len(seen)):
         mj_step(model, data)
-        sound = True
+        is_valid = True
         for joint in range(places.shape[1]):
             seen[step, 0, joint] = memory[places[0, joint]]
             seen[step, 1, joint] = memory[places[1, joint]]
             seen[step, 2, joint] = memory[places[2, joint]] + memory[places[3, joint]]
             for kind in range(3):
-                sound &= low[kind, joint] <= seen[step, kind, joint] <= high[kind, joint]
+                is_valid &= low[kind, joint] <= seen[step, kind, joint] <= high[kind, joint]
         for contact in range(contacts[0]):
-            sound &= not (touch[geoms[contact, 0], geoms[contact, 1]] and distance[contact] < 0.0)
+            is_valid &= not (
+                touch[geoms[contact, 0], geoms[contact, 1]] and distance[contact] < 0.0
+            )
         for warned in warnings:
-            sound &= warned == 0
-        if step + 1 == len(seen):  # an earlier step's would be a warning of the next
+            is_valid &= warned == 0
+        # A state of an earlier step that is not finite makes MuJoCo warn in the next step.
+        if step + 1 == len(seen):
             mj_get_state(model, data, after.ctypes.data, PHYSICS)
             for value in after:
-                sound &= math.isfinite(value)
-        if not sound:
+                is_valid &= math.isfinite(value)
+        if not is_valid:
             return -(step + 1)
-    time_s = np.full(1, end_s)  # exactly: what steps add up to differs in the last bit
+    # The sum of the steps may differ from `end_s` in the last bit.
+    time_s = np.full(1, end_s)
     mj_set_state(model, data, time_s.ctypes.data, TIME)
     return len(seen)

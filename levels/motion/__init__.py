@@ -1,3 +1,1 @@
-"""Motion along a path in joint space: its geometry, the limits of its parameter, its timing. Pure
-functions of data.
-"""
+"""Motion along a path in joint space: its geometry, limits and timing, as pure functions."""

@@ -12,28 +12,30 @@ from rack.levels.algebra import Array, Ints, norm
 from rack.levels.compiled import compiled_for
 
 COINCIDENT_RAD = 1e-7
-"""Waypoints closer than this count as one, and a shorter blend counts as none."""
+"""Waypoints closer than this count as one, and shorter blends count as 0."""
 MAX_STRAIGHT_BEND = 1e-9
-"""Two unit directions that differ by less than this count as equal: the corner between them needs
-no stop."""
+"""Difference of two unit directions below which they count as equal.
+
+A corner between such directions needs no stop.
+"""
 OVERLAP_ROUNDING = 1e-9
-"""Blends may overlap by this part of the line between them, from rounding."""
+"""Fraction of a line by which its blends may overlap, to allow for rounding."""
 
 
 class Path(NamedTuple):
-    """A path in the form that messages carry: waypoints and blends."""
+    """A path as messages carry it: waypoints and blends."""
 
     waypoints: Array  # (k, joints), rad
-    blend: Array  # (k,), rad: each corner is rounded over this length on both sides
+    blend: Array  # (k,), rad: length over which a corner is rounded, on each side
 
     @property
     def end(self) -> Array:
-        """The last waypoint (joints,), rad."""
+        """Last waypoint, (joints,), rad."""
         return np.asarray(self.waypoints[-1])
 
 
 class PathPoint(NamedTuple):
-    """One point of a path and the derivatives by its parameter s there."""
+    """A point of a path and its derivatives by the path parameter s."""
 
     q: Array  # (joints,), rad
     dq_ds: Array  # (joints,), 1
@@ -41,7 +43,7 @@ class PathPoint(NamedTuple):
 
 
 class PathBounds(NamedTuple):
-    """Largest magnitudes of the path's derivatives by s on each of its pieces."""
+    """Largest magnitudes of the derivatives by s on each piece of a path."""
 
     first: Array  # (pieces, joints), 1
     second: Array  # (pieces, joints), 1/rad
@@ -64,10 +66,15 @@ class BlendedPath:
     """
 
     def __init__(self, waypoints: ArrayLike, blend: ArrayLike) -> None:
-        """Build the path of `waypoints` (k, joints) in rad with `blend` (k,) in rad.
+        """Build a path.
 
-        Raises `ValueError` for shapes that do not match, values that are not finite, a negative
-        blend, and blends of neighbours that overlap.
+        Args:
+            waypoints: (k, joints), rad.
+            blend: Length over which each corner is rounded, on each side, (k,), rad.
+
+        Raises:
+            ValueError: Shapes do not match, values are not finite, or blends are negative or
+                overlap.
         """
         points, radii = _distinct(*_checked(waypoints, blend))
         steps = np.diff(points, axis=0)
@@ -76,7 +83,7 @@ class BlendedPath:
         self.waypoints = points  # (k, joints), rad, without coincident ones
         self.blend = radii  # (k,), rad
         self.joints = points.shape[1]
-        # From each waypoint to the next one, and what a corner changes of it.
+        # Unit directions from each waypoint to the next, and their change at each corner.
         directions = np.vstack((steps / lengths[:, None], np.zeros_like(points[:1])))
         self._changes = np.zeros_like(points)
         self._changes[1:-1] = np.diff(directions[:-1], axis=0)
@@ -89,7 +96,7 @@ class BlendedPath:
         before = at - (radius > 0.0)
         blends = radius[:, None]
         changes = np.where(blends > 0.0, self._changes[at], 0.0)
-        # The rows of `set_point`.
+        # In the layout of `compute_point`.
         self._marks = np.hstack((self.breaks[:-1, None], self._corners[at, None], blends))
         self._table = np.stack((points[at], directions[before], changes), axis=1)
         self._point = np.zeros((3, self.joints))
@@ -107,22 +114,27 @@ class BlendedPath:
         return PathPoint(*self._point)
 
     def pieces_at(self, s: ArrayLike) -> Ints:
-        """Return the indices of the pieces that contain `s`; at a break, of the piece that begins
-        there.
+        """Return the indices of the pieces that contain `s`, rad.
+
+        At a break this is the following piece.
         """
-        found = np.searchsorted(self.breaks, s, side="right") - 1
-        return np.clip(found, 0, len(self.breaks) - 2)
+        pieces = np.searchsorted(self.breaks, s, side="right") - 1
+        return np.clip(pieces, 0, len(self.breaks) - 2)
 
     def sample(self, step_rad: float) -> Array:
-        """Return points along the path, both ends included, at most `step_rad` of s apart; (n,
-        joints).
+        """Return points along the path, including both ends, (n, joints), rad.
+
+        Consecutive points are at most `step_rad` of s apart.
         """
         count = max(int(np.ceil(self.length / step_rad)), 1) + 1 if self.length > 0.0 else 1
         return points_at.load()(self._marks, self._table, np.linspace(0.0, self.length, count))
 
     def _lay_pieces(self) -> tuple[list[tuple[int, float]], list[float]]:
-        """Cut the path into lines and corners: return the waypoint of each, with its blend, rad,
-        or 0 for the line that begins there; and their breaks.
+        """Divide the path into lines and corners.
+
+        Returns:
+            The pieces and their breaks, rad. A piece is the index of its waypoint with the blend of
+            a corner, or with 0 for the line that starts at the waypoint.
         """
         last = len(self.waypoints) - 1
         starts: list[float] = self._corners.tolist()
@@ -130,7 +142,7 @@ class BlendedPath:
         breaks = [0.0]
         for corner, b in enumerate(self.blend.tolist()[1:], start=1):
             start = starts[corner]
-            # Adjacent blends leave no line between them.
+            # Between adjacent blends there is no line.
             for piece, end in (((corner - 1, 0.0), start - b), ((corner, b), start + b)):
                 if end - breaks[-1] > COINCIDENT_RAD:
                     pieces.append(piece)
@@ -142,18 +154,25 @@ class BlendedPath:
 
 @compiled_for("f8[:,::1], f8[:,:,::1], f8, f8[:,::1]")
 def set_point(
-    marks: Array,  # (pieces, 3), rad: s where it begins, s of its waypoint, its blend; 0: a line
-    table: Array,  # (pieces, 3, joints): the waypoint, rad, the direction there, its change
-    s: float,  # rad
-    point: Array,  # (3, joints): set, in the rows of `PathPoint`
+    marks: Array,
+    table: Array,
+    s: float,
+    point: Array,
 ) -> None:
-    """Set the point of a path at `s`: q = P + u1 sigma + (u2 - u1) h, and its derivatives."""
+    """Compute the point of a path at `s`: q = P + u1 sigma + (u2 - u1) h, and its derivatives.
+
+    Args:
+        marks: (pieces, 3), rad: s at the start of each piece, s of its waypoint, its blend (0 for a
+            line).
+        table: (pieces, 3, joints): the waypoint, rad, the unit direction before it, and its change
+            there.
+        s: Path parameter, rad.
+        point: Receives the result, (3, joints), in the row order of `PathPoint`.
+    """
     piece = len(marks) - 1
     while piece > 0 and s < marks[piece, 0]:
         piece -= 1
-    waypoint = table[piece, 0]
-    direction = table[piece, 1]
-    change = table[piece, 2]
+    waypoint, direction, change = table[piece]
     b = marks[piece, 2]
     sigma = s - marks[piece, 1]
     for j in range(len(waypoint)):
@@ -173,7 +192,13 @@ def set_point(
 
 @compiled_for("f8[:,::1], f8[:,:,::1], f8[::1]")
 def points_at(marks: Array, table: Array, places: Array) -> Array:
-    """Return the points of a path at `places` (n,), rad: (n, joints), rad."""
+    """Return points of a path, (n, joints), rad.
+
+    Args:
+        marks: See `compute_point`.
+        table: See `compute_point`.
+        places: Path parameters, (n,), rad.
+    """
     points = np.empty((len(places), table.shape[2]))
     point = np.empty((3, table.shape[2]))
     for k in range(len(places)):
@@ -183,41 +208,43 @@ def points_at(marks: Array, table: Array, places: Array) -> Array:
 
 
 def _checked(waypoints: ArrayLike, blend: ArrayLike) -> tuple[Array, Array]:
+    """Return waypoints and blends as arrays, after checking shapes and values."""
     points = np.array(waypoints, dtype=float)
     radii = np.array(blend, dtype=float)
     if points.ndim != 2 or len(points) == 0:
-        raise ValueError(f"path: waypoints of shape {points.shape}; valid: (k, joints) with k >= 1")
+        raise ValueError(f"path: waypoints have shape {points.shape}, must be (k, joints), k >= 1")
     if radii.shape != (len(points),):
         raise ValueError(
-            f"path: blend of shape {radii.shape}; valid: {(len(points),)}, one per waypoint"
+            f"path: blend has shape {radii.shape}, must be {(len(points),)}, one per waypoint"
         )
     if not (np.isfinite(points).all() and np.isfinite(radii).all()):
         raise ValueError("path: a waypoint or a blend is not finite")
     if (radii < 0.0).any():
         raise ValueError(
-            f"path: blend {radii.min():.4g} rad of corner {radii.argmin()}; valid: 0 or more"
+            f"path: blend of corner {radii.argmin()} is {radii.min():.4g} rad, must be 0 or more"
         )
     return points, radii
 
 
 def _distinct(points: Array, radii: Array) -> tuple[Array, Array]:
-    """Merge coincident waypoints; clear the blends of the two ends."""
-    kept = [0]
+    """Merge coincident waypoints, and set the blends of both ends to 0."""
+    distinct = [0]
     merged = radii.copy()
     for k in range(1, len(points)):
-        if norm(points[k] - points[kept[-1]]) > COINCIDENT_RAD:
-            kept.append(k)
+        if norm(points[k] - points[distinct[-1]]) > COINCIDENT_RAD:
+            distinct.append(k)
         else:
-            merged[kept[-1]] = min(merged[kept[-1]], radii[k])
+            merged[distinct[-1]] = min(merged[distinct[-1]], radii[k])
     merged[merged < COINCIDENT_RAD] = 0.0
-    merged[kept[0]] = merged[kept[-1]] = 0.0
-    return points[kept], merged[kept]
+    merged[distinct[0]] = merged[distinct[-1]] = 0.0
+    return points[distinct], merged[distinct]
 
 
 def _check_overlap(radii: Array, lengths: Array) -> None:
+    """Check that neighbouring blends fit on the line between them."""
     for k, length in enumerate(lengths):
         if radii[k] + radii[k + 1] > length * (1.0 + OVERLAP_ROUNDING) + COINCIDENT_RAD:
             raise ValueError(
                 f"path: blends {radii[k]:.4g} and {radii[k + 1]:.4g} rad of corners {k} and {k + 1}"
-                f" overlap; valid: together at most the line between them, {length:.4g} rad"
+                f" overlap; the line between them is only {length:.4g} rad long"
             )

@@ -1,7 +1,7 @@
-"""Time along a path: sections of constant jerk of its parameter s, within the limits of every
-joint; ramps to rest.
+"""Timing of a path: sections of constant jerk of its parameter s, and ramps to rest.
 
-The limits of s are the joint limits seen along the path, and the speeds that they permit.
+The limits of s follow from the joint limits, transformed along the path, and from the speeds that
+they permit.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from rack.levels.motion.path import COINCIDENT_RAD, BlendedPath, PathBounds
 from rack.levels.robot.limits import Limits
 
 SHARES = (1.0, 0.9, 0.75, 0.6)
-"""Parts of a curve's highest speed that are tried; the fastest trajectory is taken."""
+"""Fractions of a curve's highest speed that are tried. The fastest trajectory is used."""
 MIN_SECTION_S = 1e-12
 """Sections shorter than this are dropped."""
 STOP_EFFORTS = (
@@ -33,17 +33,19 @@ STOP_EFFORTS = (
     (0.2, 0.15),
     (0.1, 0.1),
 )
-"""Parts of a straight line's deceleration and jerk that a stop tries; a curve leaves less of
-both."""
+"""Fractions of a straight line's deceleration and jerk that are tried for a stop.
+
+A curve permits less of both.
+"""
 STOP_INTERVALS = 24
-"""Intervals of equal time in which the joint limits of a stop are checked."""
+"""Number of intervals of equal time in which the joint limits of a stop are checked."""
 LIMIT_ROUNDING = 1e-6
-"""Part of a limit that a stop may exceed, from rounding."""
+"""Fraction by which a stop may exceed a limit, to allow for rounding."""
 MAX_REST_RAD_S = 1e-7
-"""Motion slower than this counts as rest."""
+"""Speed below which motion counts as rest."""
 
 Section = tuple[float, float, float, float, float]
-"""Duration, s, then s, ds, dds at its begin and its constant jerk."""
+"""Duration, s, then s, ds and dds at the start, and the constant jerk."""
 
 
 class PathState(NamedTuple):
@@ -55,17 +57,20 @@ class PathState(NamedTuple):
 
 
 REACHABLE_PART = 1.0 - 1e-7
-"""Part of a reachable change of speed that is used: at the exact limit, rounding decides whether it
-is reachable."""
+"""Fraction of a reachable change of speed that is used.
+
+At the exact limit, rounding would decide whether the change is reachable.
+"""
 MIN_ACCELERATION_PART = 1e-6
-"""Acceleration or jerk below this part of the speed, in 1/s or 1/s2, counts as none."""
+"""Ratio of acceleration or jerk to speed, 1/s or 1/s2, below which they count as 0."""
 SMALLEST_LINEAR_TERM = 1e-12
-"""A cubic with a smaller linear coefficient is solved without it."""
+"""Linear coefficient of a cubic below which it is ignored."""
 
 
 class SpeedLimits(NamedTuple):
-    """Limits of ds/dt and its derivatives, in rad/s, rad/s2, rad/s3; acceleration 0: constant
-    speed.
+    """Limits of ds/dt and its derivatives: rad/s, rad/s2, rad/s3.
+
+    If the acceleration is 0, the speed is constant.
     """
 
     speed: float
@@ -74,12 +79,15 @@ class SpeedLimits(NamedTuple):
 
 
 def speed_limits(piece: PathBounds, limits: Limits, share: float) -> SpeedLimits:
-    """Return limits of s that keep every joint within `limits` on a piece with the given bounds,
-    (joints,) each.
+    """Return limits of s that keep every joint within its limits on a piece of a path.
 
-    The joints move with q' ds, q'' ds^2 + q' dds and q''' ds^3 + 3 q'' ds dds + q' ddds. `share` (0
-    to 1) is the part used of the highest speed that the bend of a curve permits: a smaller share
-    leaves more to accelerate with.
+    The joints move with q' ds, q'' ds^2 + q' dds and q''' ds^3 + 3 q'' ds dds + q' ddds.
+
+    Args:
+        piece: Bounds of the derivatives on the piece, (joints,) each.
+        limits: Limits of the joints.
+        share: Fraction, 0 to 1, of the highest speed that the bend of a curve permits. A smaller
+            fraction leaves more acceleration.
     """
     first, second, third = piece
     velocity = limits.velocity
@@ -93,22 +101,29 @@ def speed_limits(piece: PathBounds, limits: Limits, share: float) -> SpeedLimits
             share * math.sqrt(least_ratio(acceleration, second)),
             share * math.cbrt(least_ratio(jerk, third)),
         )
-    left = np.maximum(acceleration - second * speed**2, 0.0)
-    left_jerk = np.maximum(jerk - third * speed**3, 0.0)
-    most = least_ratio(left, first)
+    acceleration_left = np.maximum(acceleration - second * speed**2, 0.0)
+    jerk_left = np.maximum(jerk - third * speed**3, 0.0)
+    max_acceleration = least_ratio(acceleration_left, first)
     if curved:
-        most = min(most, 0.5 * least_ratio(left_jerk, 3.0 * second * speed))
-    change = least_ratio(np.maximum(left_jerk - 3.0 * second * speed * most, 0.0), first)
-    if min(most, change) < MIN_ACCELERATION_PART * speed:
+        max_acceleration = min(max_acceleration, 0.5 * least_ratio(jerk_left, 3.0 * second * speed))
+    max_jerk = least_ratio(
+        np.maximum(jerk_left - 3.0 * second * speed * max_acceleration, 0.0), first
+    )
+    if min(max_acceleration, max_jerk) < MIN_ACCELERATION_PART * speed:
         return SpeedLimits(speed, 0.0, 0.0)
-    return SpeedLimits(speed, most, change)
+    return SpeedLimits(speed, max_acceleration, max_jerk)
 
 
 def reachable_speed(start: float, length: float, limits: SpeedLimits) -> float:
-    """Return the highest speed reachable from speed `start` over `length` rad, both without
-    acceleration, in rad/s.
+    """Return the highest speed reachable from a given speed over a length, rad/s.
 
-    By symmetry it is also the highest speed from which `start` can still be reached.
+    The acceleration is 0 at both ends. By symmetry this is also the highest speed from which
+    `start` can be reached.
+
+    Args:
+        start: Speed at the start, rad/s.
+        length: Length, rad.
+        limits: Limits of the speed.
     """
     a = limits.acceleration
     j = limits.jerk
@@ -124,8 +139,9 @@ def reachable_speed(start: float, length: float, limits: SpeedLimits) -> float:
 
 
 def boundary_speeds(lengths: Sequence[float], limits: Sequence[SpeedLimits]) -> list[float]:
-    """Return the highest speeds at the ends of consecutive stretches, from rest to rest, in
-    rad/s.
+    """Return the highest speeds at the ends of consecutive stretches, from rest to rest, rad/s.
+
+    `lengths` are in rad, one for each stretch.
     """
     speeds = [0.0]
     for k, (length, limit) in enumerate(zip(lengths, limits, strict=True)):
@@ -137,12 +153,12 @@ def boundary_speeds(lengths: Sequence[float], limits: Sequence[SpeedLimits]) -> 
 
 
 def least_ratio(room: Array, rate: Array) -> float:
-    """Return the least room / rate over the joints that move; infinite when none does."""
+    """Return the least room / rate over the joints that move. Infinite if none does."""
     return float(np.divide(room, rate, out=np.full(len(rate), np.inf), where=rate > 0.0).min())
 
 
 def _root_of_cubic(p: float, q: float) -> float:
-    """Return the real root of x^3 + p x = q for p, q >= 0 (hyperbolic form of Cardano's)."""
+    """Return the real root of x^3 + p x = q for p, q >= 0 (Cardano's hyperbolic form)."""
     if p < SMALLEST_LINEAR_TERM:
         return math.cbrt(q)
     r = math.sqrt(p / 3.0)
@@ -150,38 +166,41 @@ def _root_of_cubic(p: float, q: float) -> float:
 
 
 class Trajectory:
-    """Motion along a path as sections of constant jerk, from rest or from motion to rest."""
+    """Motion along a path as sections of constant jerk, ending at rest.
+
+    It may start from rest or from motion.
+    """
 
     def __init__(self, sections: Array, duration: float) -> None:
-        self.sections = (
-            sections  # (n, 5), n >= 1: start in s; s, ds, dds and jerk of the path parameter there
-        )
+        # (n, 5), n >= 1: start time in s; then s, ds, dds and jerk of the path parameter.
+        self.sections = sections
         self.duration = duration  # s
         self.begin = float(sections[0, 1])  # path parameter at the start, rad
         self.end = self.at(duration).s  # path parameter at the end, rad
 
     def at(self, time_s: float) -> PathState:
-        """Return the state `time_s` after the start."""
+        """Return the state at `time_s` after the start, clamped to the duration."""
         time_s = min(max(time_s, 0.0), self.duration)
         k = int(np.searchsorted(self.sections[:, 0], time_s, side="right")) - 1
         start, *state = self.sections[max(k, 0)].tolist()
         return PathState(*_moved(time_s - start, *state))
 
     def states(self, times_s: Array) -> tuple[Array, Array, Array]:
-        """Return s, ds and dds at `times_s` (n,), within the duration; (n,) each."""
+        """Return s, ds and dds at `times_s` (n,), which must be within the duration; (n,) each."""
         row = self.sections[np.searchsorted(self.sections[:, 0], times_s, side="right") - 1]
         return _moved(times_s - row[:, 0], *row[:, 1:].T)
 
     def stretched(self, factor: float) -> Trajectory:
-        """Return the same motion slowed by `factor` >= 1; it keeps every limit that this one
-        keeps.
+        """Return the same motion slowed by `factor`, which must be at least 1.
+
+        It keeps all limits that this motion keeps.
         """
         powers = np.array([factor, 1.0, 1.0 / factor, 1.0 / factor**2, 1.0 / factor**3])
         return Trajectory(self.sections * powers, self.duration * factor)
 
 
 def _moved(t: Any, s: Any, ds: Any, dds: Any, jerk: Any) -> tuple[Any, Any, Any]:
-    """Return s, ds and dds, numbers or arrays, after time `t` under a constant jerk."""
+    """Return s, ds and dds after time `t` under constant jerk; arguments are numbers or arrays."""
     return (
         s + t * (ds + t * (dds / 2.0 + t * jerk / 6.0)),
         ds + t * (dds + t * jerk / 2.0),
@@ -190,10 +209,16 @@ def _moved(t: Any, s: Any, ds: Any, dds: Any, jerk: Any) -> tuple[Any, Any, Any]
 
 
 def make_trajectory(path: BlendedPath, limits: Limits, begin: float = 0.0) -> Trajectory:
-    """Make the fastest motion found from rest at `begin`, in rad, to rest at the end of `path`.
+    """Compute a fast motion from rest to rest at the end of a path.
 
-    It rests at the path's stops too. The path's analytic bounds, not samples, ensure that joint
-    velocity, acceleration and jerk keep `limits` everywhere. At most `SECTIONS` sections.
+    The motion also rests at the stops of the path. Analytic bounds of the path, not samples, ensure
+    that joint velocity, acceleration and jerk keep the limits everywhere. The result has at most
+    `SECTIONS` sections.
+
+    Args:
+        path: The path.
+        limits: Limits of the joints.
+        begin: Path parameter at the start, rad.
     """
     stops = [s for s in path.stops if s > begin + COINCIDENT_RAD]
     marks = [min(begin, path.length), *stops, path.length]
@@ -205,61 +230,72 @@ def make_trajectory(path: BlendedPath, limits: Limits, begin: float = 0.0) -> Tr
 
 
 def make_stop(path: BlendedPath, limits: Limits, state: PathState) -> Trajectory | None:
-    """Make the shortest ramp found to rest along `path` from `state` that keeps the joint limits.
+    """Compute a short ramp to rest along a path that keeps the joint limits.
 
-    None: every ramp would exceed a limit or overrun the path. Motion may then follow its
-    trajectory, which itself ends at rest, and try again a cycle later. The time taken is bounded
-    for every path.
+    The computing time is bounded for every path.
+
+    Args:
+        path: The path.
+        limits: Limits of the joints.
+        state: State at the start of the ramp.
+
+    Returns:
+        The shortest ramp found. None if every ramp would exceed a limit or overrun the path. Motion
+        may then follow its trajectory, which itself ends at rest, and try again a cycle later.
     """
     if state.ds < MAX_REST_RAD_S:
         return _joined([], state.s)
     rate = path.bounds.first[path.pieces_at(state.s)]
-    most = least_ratio(limits.acceleration, rate)
-    jerk = least_ratio(limits.jerk, rate)
-    # After a stop the path continues in another direction: the motion must rest there.
+    max_acceleration = least_ratio(limits.acceleration, rate)
+    max_jerk = least_ratio(limits.jerk, rate)
+    # Motion must rest at a stop, because the path continues in another direction.
     end = (
         next((s for s in path.stops if s > state.s - COINCIDENT_RAD), path.length) + COINCIDENT_RAD
     )
-    for part, part_of_jerk in STOP_EFFORTS:
-        stop = _ramp(state, max(part * most, abs(state.dds)), part_of_jerk * jerk)
+    for fraction, jerk_fraction in STOP_EFFORTS:
+        stop = _ramp(
+            state, max(fraction * max_acceleration, abs(state.dds)), jerk_fraction * max_jerk
+        )
         if stop.end <= end and _keeps(stop, path, limits):
             return stop
     return None
 
 
 def _fastest(path: BlendedPath, start: float, end: float, limits: Limits) -> list[Section]:
-    """Return the fastest of a few candidates, between two points of rest of a path, that fit into a
-    message.
+    """Return the fastest of a few motions between two points of rest of a path.
+
+    Only motions with few enough sections for a message are considered.
     """
     first, last = path.pieces_at((start, end - COINCIDENT_RAD))
     bounds = PathBounds(*(bound[first : last + 1] for bound in path.bounds))
     corners = int(bounds.second.any(axis=1).sum())
-    ways = [([start, *path.breaks[first + 1 : last + 1].tolist(), end], bounds)]
-    if last > first:  # one set of limits for all pieces suits many small corners
-        ways.append(
+    candidates = [([start, *path.breaks[first + 1 : last + 1].tolist(), end], bounds)]
+    # One set of limits for all pieces suits many small corners.
+    if last > first:
+        candidates.append(
             ([start, end], PathBounds(*(bound.max(axis=0, keepdims=True) for bound in bounds)))
         )
     best: list[Section] = []
-    least = np.inf
+    least_time_s = np.inf
     for share in SHARES if corners else SHARES[:1]:
-        for marks, pieces in ways:
+        for marks, pieces in candidates:
             stretches = [
                 speed_limits(PathBounds(*piece), limits, share)
                 for piece in zip(*pieces, strict=True)
             ]
-            rows = list(_sections(marks, stretches))
-            time_s = math.fsum(
-                row[0] for row in rows
-            )  # exact: `sum` rounds otherwise from Python 3.12 on
-            if time_s < least and len(rows) <= SECTIONS_A_LINE * (1 + corners):
-                best = rows
-                least = time_s
+            sections = list(_sections(marks, stretches))
+            # `fsum` is exact, whereas `sum` rounds differently from Python 3.12 on.
+            time_s = math.fsum(row[0] for row in sections)
+            if time_s < least_time_s and len(sections) <= SECTIONS_A_LINE * (1 + corners):
+                best = sections
+                least_time_s = time_s
     return best
 
 
 def _sections(marks: Sequence[float], limits: Sequence[SpeedLimits]) -> Iterator[Section]:
-    """Yield the sections from rest at the first to rest at the last mark, each stretch with its
-    limits.
+    """Yield the sections from rest at the first mark to rest at the last.
+
+    `marks` are path parameters, rad. Each stretch between two marks has an entry in `limits`.
     """
     lengths = [end - start for start, end in pairwise(marks)]
     speeds = boundary_speeds(lengths, limits)
@@ -267,48 +303,51 @@ def _sections(marks: Sequence[float], limits: Sequence[SpeedLimits]) -> Iterator
         marks, lengths, limits, pairwise(speeds), strict=False
     ):
         if limit.acceleration > 0.0:
-            wanted = _from(PathState(start, before, 0.0), limit.acceleration, limit.jerk)
-            wanted.target_position = [start + length]
-            wanted.target_velocity = [after]
-            wanted.max_velocity = [limit.speed]
-            yield from _calculated(wanted)
+            request = _from(PathState(start, before, 0.0), limit.acceleration, limit.jerk)
+            request.target_position = [start + length]
+            request.target_velocity = [after]
+            request.max_velocity = [limit.speed]
+            yield from _calculated(request)
         else:
             lasts_s = length / before if before > 0.0 else np.inf
             yield (lasts_s, start, before, 0.0, 0.0)
 
 
 def _ramp(state: PathState, acceleration: float, jerk: float) -> Trajectory:
-    wanted = _from(state, acceleration, jerk)
-    wanted.control_interface = ruckig.ControlInterface.Velocity
-    return _joined(_calculated(wanted), state.s)
+    """Return the fastest ramp from `state` to rest within `acceleration` and `jerk`."""
+    request = _from(state, acceleration, jerk)
+    request.control_interface = ruckig.ControlInterface.Velocity
+    return _joined(_calculated(request), state.s)
 
 
 def _from(state: PathState, acceleration: float, jerk: float) -> ruckig.InputParameter:
-    """Return what ruckig is asked for from a state within limits, in one dimension."""
-    wanted = ruckig.InputParameter(1)
-    wanted.current_position = [state.s]
-    wanted.current_velocity = [state.ds]
-    wanted.current_acceleration = [state.dds]
-    wanted.max_acceleration = [acceleration]
-    wanted.max_jerk = [jerk]
-    return wanted
+    """Return the input of ruckig for motion from `state`, in one dimension."""
+    request = ruckig.InputParameter(1)
+    request.current_position = [state.s]
+    request.current_velocity = [state.ds]
+    request.current_acceleration = [state.dds]
+    request.max_acceleration = [acceleration]
+    request.max_jerk = [jerk]
+    return request
 
 
-def _calculated(wanted: ruckig.InputParameter) -> list[Section]:
-    """Return the sections of ruckig's answer in one dimension. Raises `ArithmeticError` when it has
-    none.
+def _calculated(request: ruckig.InputParameter) -> list[Section]:
+    """Return the sections of ruckig's result in one dimension.
+
+    Raises:
+        ArithmeticError: ruckig finds no solution.
     """
-    found = ruckig.Trajectory(1)
-    result = ruckig.Ruckig(1).calculate(wanted, found)
+    trajectory = ruckig.Trajectory(1)
+    result = ruckig.Ruckig(1).calculate(request, trajectory)
     if result != ruckig.Result.Working:
-        raise ArithmeticError(f"trajectory: ruckig returned {result} for {wanted}")
-    profile = found.profiles[0][0]
+        raise ArithmeticError(f"trajectory: ruckig returned {result} for {request}")
+    profile = trajectory.profiles[0][0]
     rows = zip(profile.t, profile.p, profile.v, profile.a, profile.j, strict=False)
     return [row for row in rows if row[0] > MIN_SECTION_S]
 
 
 def _joined(rows: Sequence[Section], begin: float) -> Trajectory:
-    """Return the trajectory of consecutive sections; without sections, rest at `begin`."""
+    """Return the trajectory of consecutive sections, or rest at `begin` without sections."""
     if not rows:
         return Trajectory(np.array([[0.0, begin, 0.0, 0.0, 0.0]]), 0.0)
     sections = np.array(rows)
@@ -318,35 +357,37 @@ def _joined(rows: Sequence[Section], begin: float) -> Trajectory:
 
 
 def _keeps(stop: Trajectory, path: BlendedPath, limits: Limits) -> bool:
-    """Return whether every joint keeps its limits, by bounds of motion and path over each interval
-    of time.
+    """Return True if every joint keeps its limits during a stop.
+
+    The check uses bounds of motion and path over each interval of time.
     """
-    switches = stop.sections[:, 0]
     times = _checked_times(stop)
     s, ds, dds = stop.states(times)
-    jerk = np.abs(stop.sections[np.searchsorted(switches, times[:-1], side="right") - 1, 4])
-    # Within an interval dds is linear and does not change its sign: the ends bound both dds and ds.
-    most = np.maximum(np.abs(dds[:-1]), np.abs(dds[1:]))
-    speed = np.maximum(ds[:-1], ds[1:])
+    section = np.searchsorted(stop.sections[:, 0], times[:-1], side="right") - 1
+    jerk = np.abs(stop.sections[section, 4])[:, None]
+    # In an interval dds is linear and keeps its sign, so values at the ends bound dds and ds.
+    acceleration = np.maximum(np.abs(dds[:-1]), np.abs(dds[1:]))[:, None]
+    speed = np.maximum(ds[:-1], ds[1:])[:, None]
     first, second, third = _bounds_over(path, s)
-    speed = speed[:, None]
-    most = most[:, None]
-    jerk = jerk[:, None]
-    cubed = speed * speed * speed  # of an array, ** 3 is not the same on every processor
-    room = 1.0 + LIMIT_ROUNDING
+    # The result of ** 3 on an array differs between processors.
+    cubed = speed * speed * speed
+    tolerance = 1.0 + LIMIT_ROUNDING
+    # A jerk too small to end the present deceleration in time would reverse the motion.
     return bool(
-        (
-            ds > -LIMIT_ROUNDING
-        ).all()  # a jerk too small to end the present deceleration would reverse the motion
-        and (first * speed <= limits.velocity * room).all()
-        and (second * speed**2 + first * most <= limits.acceleration * room).all()
-        and (third * cubed + 3.0 * second * speed * most + first * jerk <= limits.jerk * room).all()
+        (ds > -LIMIT_ROUNDING).all()
+        and (first * speed <= limits.velocity * tolerance).all()
+        and (second * speed**2 + first * acceleration <= limits.acceleration * tolerance).all()
+        and (
+            third * cubed + 3.0 * second * speed * acceleration + first * jerk
+            <= limits.jerk * tolerance
+        ).all()
     )
 
 
 def _checked_times(stop: Trajectory) -> Array:
-    """Return the ends of the intervals: evenly spread, and wherever jerk or the sign of dds
-    changes.
+    """Return the ends of the checked intervals, s.
+
+    They are evenly spaced, with further ends where jerk or the sign of dds changes.
     """
     start = stop.sections[:, 0]
     dds = stop.sections[:, 3]
@@ -359,7 +400,7 @@ def _checked_times(stop: Trajectory) -> Array:
 
 
 def _bounds_over(path: BlendedPath, s: Array) -> tuple[Array, Array, Array]:
-    """Return the bounds of the path's derivatives between consecutive `s`; (n - 1, joints) each."""
+    """Return bounds of the path derivatives between consecutive `s`, (n - 1, joints) each."""
     piece = path.pieces_at(s)
     low = piece[:-1]
     high = piece[1:]

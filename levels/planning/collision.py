@@ -231,7 +231,7 @@ class CollisionChecker:
             self.open_gripper(opening)
             mujoco.mj_kinematics(self._model, data)
             axis = data.site_xmat[self.cell.tool].reshape(3, 3)[:, 2]
-            extents.append((farthest(self._model, data, self.cell.gripper_geoms, axis), opening))
+            extents.append((farthest(self._model, data, self.cell.geoms.gripper, axis), opening))
         self.open_gripper(gripper.open)
         reached, opening = max(extents)
         return float(opening) if reached > extents[0][0] + self._margin else None
@@ -239,9 +239,7 @@ class CollisionChecker:
     def _apply(self) -> None:
         """Update the required distances for the held object and the one that may be touched."""
         self._required[:] = self._base
-        arm = self.cell.arm_geoms
-        gripper = self.cell.gripper_geoms
-        supports = self.cell.supports
+        arm, gripper, supports, _ = self.cell.geoms
         if self.held is not None:
             held = self._row_geoms[self.held]
             self._require(held, np.arange(self._model.ngeom), self.clearance)
@@ -276,11 +274,11 @@ def restricted_to_arm(cell: Cell, clearance: float, margin: float) -> mujoco.MjM
     """
     model = copy.copy(cell.model)
     solid = (model.geom_contype | model.geom_conaffinity) != 0
-    arm = np.isin(np.arange(model.ngeom), cell.arm_geoms)
+    arm = np.isin(np.arange(model.ngeom), cell.geoms.arm)
     model.geom_contype[:] = LINK * (arm & solid)
     model.geom_conaffinity[:] = (LINK | GRIPPER | LOAD) * solid
-    model.geom_contype[cell.gripper_geoms] *= GRIPPER
-    model.geom_conaffinity[cell.gripper_geoms] &= LINK
+    model.geom_contype[cell.geoms.gripper] *= GRIPPER
+    model.geom_conaffinity[cell.geoms.gripper] &= LINK
     # MuJoCo adds the margins of the two geoms, so two links are found within twice the margin.
     set_margins(model, np.where(arm, margin, clearance))
     model.geom_gap[:] = 0.0
@@ -307,8 +305,7 @@ def required_distances(
         Distances, (geoms, geoms), m.
     """
     model = cell.model
-    arm = cell.arm_geoms
-    gripper = cell.gripper_geoms
+    arm, gripper, *_ = cell.geoms
     first_link = model.dof_bodyid[cell.dof[0]]
     carriers = []
     body = model.body_parentid[first_link]

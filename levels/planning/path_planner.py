@@ -325,7 +325,7 @@ def lever_arms(cell: Cell, seed: int) -> Array:
         if m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE:
             return 1.0
         carried = geoms_of(m, below(m, m.jnt_bodyid[[joint]]))
-        moved = np.intersect1d(carried, cell.arm_geoms)
+        moved = np.intersect1d(carried, cell.geoms.arm)
         from_anchor = places[:, moved] - anchors[:, [joint]]
         from_axis = np.linalg.norm(np.cross(from_anchor, axes[:, [joint]]), axis=2)
         return float(np.max(from_axis + m.geom_rbound[moved], initial=0.0))

@@ -148,11 +148,11 @@ class Payloads:
             openings = openings[::-1]
         hand = cell.model.jnt_bodyid[cell.model.jnt_qposadr == linkage.driven]
         fingers = np.setdiff1d(
-            cell.gripper_geoms,
+            cell.geoms.gripper,
             np.flatnonzero(cell.model.geom_bodyid == cell.model.body_parentid[hand]),
         )
         # A single finger closes on a jaw of the body that carries the finger.
-        return self._jaws_of(fingers, openings) or self._jaws_of(cell.gripper_geoms, openings)
+        return self._jaws_of(fingers, openings) or self._jaws_of(cell.geoms.gripper, openings)
 
     def _jaws_of(self, fingers: Ints, openings: Array) -> list[Jaws]:
         """Return the jaws that some geoms form at these openings, as long as there is a gap."""
@@ -299,5 +299,5 @@ def find_fixed_jaw(cell: Cell, payloads: Payloads) -> FixedJaw | None:
     if len(fixed_sides) != 1:
         return None
     solid = (cell.model.geom_contype | cell.model.geom_conaffinity) != 0
-    geoms = cell.gripper_geoms
+    geoms = cell.geoms.gripper
     return FixedJaw(cell, geoms[is_still[geoms] & solid[geoms]], fixed_sides[0])

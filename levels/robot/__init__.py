@@ -1,6 +1,5 @@
-"""Robot and cell, built from `[robot]` and `[scene]`: model, limits, linkage of the gripper,
-dynamics.
+"""Robot and cell, built from `[robot]` and `[scene]`: model, limits, gripper linkage, dynamics.
 
-No exports: importing MuJoCo takes half a second, and not every importer of a module here needs all
-of them.
+The package exports nothing: importing MuJoCo takes half a second, and not every user of a module of
+this package needs all of them.
 """

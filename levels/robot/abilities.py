@@ -1,6 +1,4 @@
-"""What an arm can do at rest: how far its tool reaches, what it holds there, and how much torque
-gravity leaves.
-"""
+"""Abilities of an arm at rest: reach, payload, and torque left by gravity."""
 
 from __future__ import annotations
 
@@ -16,19 +14,22 @@ from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import OFF
 
 POSES = 1000
-"""Poses that are tried, all over the joints' ranges."""
+"""Number of random poses that are tried, over the joints' whole ranges."""
 STEPS = 25
-"""Positions of a joint that are tried while the arm is stretched out, and turns of all joints."""
+"""Number of positions of a joint that are tried in each pass of stretching out the arm."""
 TURNS = 4
+"""Number of passes over all joints in stretching out the arm."""
 
 
 @dataclass(frozen=True)
 class Abilities:
-    """Of an arm at rest.
+    """Abilities of an arm at rest.
 
-    `reach`, m, is the farthest place of the tool from the axis of the first joint; `payload`, kg, a
-    mass at the tool that it holds in every pose tried; `left` the part of a joint's torque that
-    gravity leaves in each of them, of the `joint` with the least, by index.
+    Attributes:
+        reach: Largest distance of the tool from the axis of the first joint, m.
+        payload: Mass at the tool that the arm can hold in every pose tried, kg.
+        left: Least fraction of a joint's torque that gravity leaves in any pose tried.
+        joint: Index of the joint with this least fraction.
     """
 
     reach: float
@@ -38,21 +39,19 @@ class Abilities:
 
 
 def abilities(cell: Cell) -> Abilities:
-    """Return what the arm of a cell can do; the worst that is found in many poses, and stretched
-    out.
-    """
+    """Compute the abilities of the arm of a cell, from many random poses and stretched out."""
     statics = Statics(cell)
     poses = statics.poses()
-    far = statics.stretched(max(poses, key=statics.distance))
-    found = [statics.held(position) for position in (*poses, far)]
-    left = np.min([parts for parts, _ in found], axis=0)
-    joint = int(left.argmin())
-    payload = max(0.0, min(mass for _, mass in found))
-    return Abilities(statics.distance(far), payload, float(left[joint]), joint)
+    stretched = statics.stretched(max(poses, key=statics.distance))
+    limits = [statics.held(position) for position in (*poses, stretched)]
+    torque_left = np.min([parts for parts, _ in limits], axis=0)
+    joint = int(torque_left.argmin())
+    payload = max(0.0, min(mass for _, mass in limits))
+    return Abilities(statics.distance(stretched), payload, float(torque_left[joint]), joint)
 
 
 class Statics:
-    """An arm that stands still, without contacts."""
+    """An arm at rest, without contacts."""
 
     def __init__(self, cell: Cell) -> None:
         self._cell = cell
@@ -62,17 +61,18 @@ class Statics:
         self._data.qvel[:] = 0.0
         self._jacobian = np.zeros((3, self._model.nv))
         self._base = int(self._model.dof_jntid[cell.dof[0]])
-        # A joint without limits turns once.
+        # A joint without limits is tried over one turn.
         self._low, self._high = np.clip(cell.limits.position, -math.pi, math.pi).T
 
     def poses(self) -> list[Array]:
-        """Return poses all over the joints' ranges, rad, the start first."""
+        """Return poses over the joints' whole ranges, rad, beginning with home."""
         drawn = np.random.default_rng(0).uniform(self._low, self._high, (POSES - 1, len(self._low)))
         return [self._cell.home, *drawn]
 
     def stretched(self, position: Array) -> Array:
-        """Return a pose that reaches as far as this one, or farther: each joint in turn at its
-        best.
+        """Return a pose that reaches at least as far as `position`.
+
+        Each joint in turn moves to the position with the largest reach.
         """
         best = position.copy()
         for _ in range(TURNS):
@@ -91,8 +91,11 @@ class Statics:
         return norm(np.cross(out, data.xaxis[self._base]))
 
     def held(self, position: Array) -> tuple[Array, float]:
-        """Return the part of each joint's torque that gravity leaves, (joints,), and the mass at
-        the tool, kg, that takes all of one.
+        """Return the torque that gravity leaves, and the payload, in a pose.
+
+        Returns:
+            Fraction of each joint's torque that gravity leaves, (joints,), and the mass at the tool
+            that uses up the torque of one joint, kg.
         """
         cell = self._cell
         data = self._data
@@ -100,10 +103,10 @@ class Statics:
         mujoco.mj_forward(self._model, data)
         mujoco.mj_jacSite(self._model, data, self._jacobian, None, cell.tool)
         torque = cell.bounds.torque
-        own = (data.qfrc_bias - data.qfrc_passive)[cell.dof]
+        gravity_torque = (data.qfrc_bias - data.qfrc_passive)[cell.dof]
         x, y, z = self._model.opt.gravity
         rows = self._jacobian[:, cell.dof]
         a_kg = -(x * rows[0] + y * rows[1] + z * rows[2])
         loaded = np.abs(a_kg) > 1e-9
-        room = (torque - np.sign(a_kg) * own)[loaded] / np.abs(a_kg[loaded])
-        return 1.0 - np.abs(own) / torque, float(room.min(initial=math.inf))
+        masses = (torque - np.sign(a_kg) * gravity_torque)[loaded] / np.abs(a_kg[loaded])
+        return 1.0 - np.abs(gravity_torque) / torque, float(masses.min(initial=math.inf))

@@ -1,10 +1,11 @@
-"""The cell: a robot and its surroundings, as one MuJoCo model and the indices into it."""
+"""The cell: a robot and its surroundings, as one MuJoCo model with indices into it."""
 
 from __future__ import annotations
 
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -31,21 +32,30 @@ from rack.levels.robot.wrist import Wrist, find_wrist
 from rack.levels.tables import GripperConfig, Interface, RobotConfig, SceneConfig, SensorConfig
 
 TOUCHING_M = 5e-5
-"""Geoms closer than this at home touch: rounding decides."""
+"""Distance below which geoms at home count as touching, because rounding decides."""
 SETTLING_S = 1.0
-"""Time in which the fingers of a gripper come to rest."""
+"""Time in which the fingers of a gripper come to rest, s."""
 
 
 @dataclass(frozen=True)
 class Gripper:
     """An arm's gripper, driven at one joint. Indices are addresses in the model."""
 
-    dof: int  # the driven joint in qvel
+    dof: int  # address of the driven joint in qvel
     actuator: int
     open: float  # joint position, m or rad
-    closed: float  # joint position when closed without a part, m or rad
+    closed: float  # joint position when closed without an object, m or rad
     stiffness: float  # of the gripper's position loop, N/m or N m/rad
-    linkage: Linkage  # positions of all its joints, by its opening
+    linkage: Linkage  # positions of all its joints as functions of its opening
+
+
+class CellGeoms(NamedTuple):
+    """Ids of the geoms between which contacts are judged."""
+
+    arm: Ints  # all that the arm moves, including the gripper's
+    gripper: Ints  # of the body that carries the gripper, and of the fingers
+    supports: Ints  # in the order of `scene.supports`
+    touch: Mask  # (ngeom, ngeom), True where a contact is unintended
 
 
 @dataclass(frozen=True)
@@ -53,66 +63,81 @@ class Cell:
     """A compiled cell. Indices are addresses in `model`."""
 
     model: mujoco.MjModel
-    """Torque motors on every joint of an arm, a force motor on the gripper; of a hand, its tendons.
-    Keyframe 0 is the start, the gripper open."""
-    joints: tuple[str, ...]  # their names
-    qpos: Ints  # (joints,), the arm's joints in qpos
-    dof: Ints  # (joints,), the same in qvel
-    actuators: Ints  # (joints,), their motors in ctrl; of a hand, its flexors
+    """Has torque motors on all joints of the arm and a force motor on the gripper. For a hand, it
+    has actuators on the tendons instead. Keyframe 0 is the start, with the gripper open."""
+
+    # The arm, or a hand in its place.
+    joints: tuple[str, ...]  # names
+    qpos: Ints  # (joints,), addresses of the joints in qpos
+    dof: Ints  # (joints,), addresses of the joints in qvel
+    actuators: Ints  # (joints,), motors in ctrl; the flexors of a hand
     home: Array  # (joints,), rad: where tasks return to
     begin: Array  # (joints,), rad: positions at the start
-    homing: bool  # drives know no position before they are enabled: they find their reference
     tool: int  # site
-    gripper: Gripper | None  # None: there is none
-    arm_geoms: Ints  # geoms that the arm moves, gripper included
-    gripper_geoms: Ints  # those of hand and fingers
-    bodies: Ints  # in the order of `scene.bodies`
-    object_qpos: Ints  # (objects,), first of 7 addresses of each object
-    mocap: Ints  # (obstacles,), mocap ids
-    supports: Ints  # geoms
-    touch: Mask  # (ngeom, ngeom), True where a contact is unintended
-    bounds: Bounds  # that the arm never exceeds
+
+    # Limits, sensors and drives of the arm.
+    bounds: Bounds  # never exceeded, fault or not
     limits: Limits  # of planned motion
-    encoders: Encoders  # resolution and noise of its sensors
-    wrist: Wrist | None  # force/torque sensor; None: there is none
+    encoders: Encoders  # resolution and noise of the joints' sensors
+    patience: MotorPatience  # of the motors or valves
+    interface: Interface  # of the drives
+    homing: bool  # drives have to find their reference before they know their position
+
+    # Devices that the arm carries.
+    gripper: Gripper | None  # None for an arm without a gripper
+    wrist: Wrist | None  # None for an arm without a force/torque sensor
     hand: Hand | None  # None for an arm
-    patience: MotorPatience  # of its motors, or valves
-    interface: Interface  # of its drives
+
+    # The surroundings.
+    bodies: Ints  # objects, then obstacles, in the order of `scene.bodies`
+    object_qpos: Ints  # (objects,), address of the first of the 7 coordinates of each object
+    mocap: Ints  # (obstacles,), mocap ids
+    geoms: CellGeoms
 
     def start(self) -> mujoco.MjData:
-        """Return data of the start: the gripper is open, objects are where the model puts them."""
+        """Return MuJoCo data of the start.
+
+        The gripper is open, and objects are where the model places them.
+        """
         data = mujoco.MjData(self.model)
         mujoco.mj_resetDataKeyframe(self.model, data, 0)
         mujoco.mj_forward(self.model, data)
         return data
 
     def parts(self, row: int) -> Ints:
-        """Return the geoms of an object or obstacle, by its row in `bodies`."""
+        """Return the geoms of an object or obstacle, given its row in `bodies`."""
         model = self.model
         return np.flatnonzero(model.body_rootid[model.geom_bodyid] == self.bodies[row])
 
 
 def build_cell(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> Cell:
-    """Build the cell; one tick of `clock_ns` is `robot.substeps` MuJoCo steps. Each caller gets a
-    model of its own.
+    """Build the cell of a rack.
 
-    The crate builds it once, before it forks the boards; in the same process only the model is
-    copied from then on.
+    The crate builds it once, before it forks the boards. Later calls in the same process only copy
+    the model. Each caller gets a separate model.
 
-    Raises `RobotError`, one line, for a file, joint, site, body or geom that is missing or of the
-    wrong kind, a list of the wrong length, a home outside the limits or in unintended contact.
+    Args:
+        robot: The `[robot]` table.
+        scene: The `[scene]` table.
+        clock_ns: Duration of a tick, ns, which is `robot.substeps` MuJoCo steps.
+
+    Raises:
+        RobotError: A file, joint, site, body or geom is missing or of the wrong kind, a list has
+            the wrong length, or home is outside the limits or in unintended contact. The text is
+            one line.
     """
     cell = _compiled(robot, scene, clock_ns)
     return replace(cell, model=copy(cell.model))
 
 
 def cell_of(context: LevelContext) -> Cell:
-    """Build the cell of a level's rack. Raises as `build_cell`."""
+    """Build the cell of a level's rack; see `build_cell`."""
     return build_cell(context.robot, context.scene, context.clock_ns)
 
 
 @lru_cache(maxsize=4)
 def _compiled(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> Cell:
+    """Build and check a cell, and cache it for later calls in this process."""
     cell = unchecked_cell(robot, scene, clock_ns)
     for key, position in (("home", cell.home), ("start", cell.begin)):
         cell.model.key_qpos[0] = start_qpos(cell, position)
@@ -123,7 +148,16 @@ def _compiled(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> Cell:
 
 
 def unchecked_cell(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> Cell:
-    """Build the cell as `build_cell` does, wherever the arm is at home. Raises `RobotError`."""
+    """Build the cell like `build_cell`, without checking the start and the gripper.
+
+    Args:
+        robot: The `[robot]` table.
+        scene: The `[scene]` table.
+        clock_ns: Duration of a tick, ns.
+
+    Raises:
+        RobotError: As for `build_cell`.
+    """
     spec = load_spec(robot.model)
     check_joints(robot, spec)
     if robot.hand is None:
@@ -133,66 +167,64 @@ def unchecked_cell(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> Cel
     prepare(spec, robot, clock_ns)
     model = compile_spec(spec, robot.model)
     check_couplings(model, robot.joints)
-    cell = index(model, robot, scene, motors, torque)
+    cell = assemble_cell(model, robot, scene, motors, torque)
     if robot.gripper is not None and ease_gripper(cell, spec, robot.gripper, clock_ns * 1e-9):
-        cell = index(compile_spec(spec, robot.model), robot, scene, motors, torque)
+        cell = assemble_cell(compile_spec(spec, robot.model), robot, scene, motors, torque)
     cell.model.key_qpos[0] = start_qpos(cell, cell.begin)
     return cell
 
 
 def sensed_by(cell: Cell, robot: RobotConfig, sensors: SensorConfig) -> Cell:
-    """Return the cell with encoders of `sensors`, unless `[robot.sensors]` says what they are."""
+    """Return the cell with the encoders `sensors`, unless `[robot.sensors]` states others."""
     tick_s = robot.substeps * cell.model.opt.timestep
     return replace(cell, encoders=Encoders.of(robot, tick_s, sensors))
 
 
 def sizes(cell: Cell) -> dict[str, int]:
-    """Return the sizes that the cell gives to messages: joints, bodies (at least 1), state; fingers
-    of a hand.
+    """Return the symbolic sizes of messages in this cell.
+
+    They are "joints", "bodies" (at least 1), "state", and "fingers" for a hand.
     """
-    found = {
+    by_name = {
         "joints": len(cell.qpos),
         "bodies": max(1, len(cell.bodies)),
         "state": state_size(cell.model),
     }
-    return found if cell.hand is None else {**found, "fingers": len(cell.hand.names)}
+    return by_name if cell.hand is None else {**by_name, "fingers": len(cell.hand.names)}
 
 
-def index(
+def assemble_cell(
     model: mujoco.MjModel,
     robot: RobotConfig,
     scene: SceneConfig,
     motors: list[str],
     torque: Array,
 ) -> Cell:
-    """Find everything that the config names in the compiled model, the torques of a hand there.
-    Raises `RobotError`.
+    """Find everything that the config names in the compiled model.
+
+    Args:
+        model: The compiled model.
+        robot: The `[robot]` table.
+        scene: The `[scene]` table.
+        motors: Names of the motors, one per joint.
+        torque: Torque limits of an arm, (joints,), N m. The limits of a hand follow from its
+            tendons.
+
+    Raises:
+        RobotError: An element is missing or of the wrong kind.
     """
     joints = np.array([model.joint(name).id for name in robot.joints])
     moved = lookup.below(model, model.jnt_bodyid[joints])
     hand = None if robot.hand is None else find_hand(model, robot, robot.hand)
     tool = lookup.tool_site(model, robot.tool_name, moved if hand is None else None)
     gripper, linked = find_gripper(model, robot, moved, joints)
-    bodies = lookup.find_all(model, mujoco.mjtObj.mjOBJ_BODY, scene.bodies, "scene")
-    objects = bodies[: len(scene.objects)]
-    obstacles = bodies[len(scene.objects) :]
-    if hand is not None:  # the palm, which its joints do not move, is a part of a hand
+    if hand is not None:
+        # The palm is a part of the hand, although no joint of the hand moves it.
         linked = moved = lookup.below(model, model.site_bodyid[[tool]]) | moved
-    arm_geoms = lookup.geoms_of(model, moved)
-    gripper_geoms = lookup.geoms_of(model, linked)
-    object_geoms = lookup.geoms_of(model, lookup.below(model, objects))
-    supports = lookup.find_all(model, mujoco.mjtObj.mjOBJ_GEOM, scene.supports, "scene.supports")
-    bounds = joint_bounds(model, joints, robot, hand.torque if hand is not None else torque)
     wrist = find_wrist(model, robot.wrist, moved)
-    touch = unintended_pairs(model, arm_geoms, gripper_geoms, object_geoms, supports)
-    if wrist is not None:  # contacts of a support and what hangs on the sensor are measured
-        pressed = lookup.geoms_of(model, lookup.below(model, model.site_bodyid[[wrist.site]]))
-        touch[np.ix_(pressed, supports)] = touch[np.ix_(supports, pressed)] = False
-    data = mujoco.MjData(model)
-    data.qpos[model.jnt_qposadr[joints]] = robot.home
-    data.qvel[model.jnt_dofadr[joints]] = robot.velocity
-    mujoco.mj_fwdPosition(model, data)
-    mujoco.mj_energyVel(model, data)
+    bodies = lookup.find_all(model, mujoco.mjtObj.mjOBJ_BODY, scene.bodies, "scene")
+    objects, obstacles = np.split(bodies, [len(scene.objects)])
+    bounds = joint_bounds(model, joints, robot, torque if hand is None else hand.torque)
     return Cell(
         model=model,
         joints=robot.joints,
@@ -201,57 +233,108 @@ def index(
         actuators=np.array([model.actuator(name).id for name in motors]),
         home=np.array(robot.home),
         begin=np.array(robot.start or robot.home),
-        homing=robot.calibration.homing,
         tool=tool,
-        gripper=gripper,
-        arm_geoms=arm_geoms,
-        gripper_geoms=gripper_geoms,
-        bodies=bodies,
-        object_qpos=model.jnt_qposadr[lookup.free_joints(model, objects)].astype(int),
-        mocap=lookup.mocap_ids(model, obstacles),
-        supports=supports,
-        touch=touch,
         bounds=bounds,
         limits=planned_limits(bounds, robot),
         encoders=Encoders.of(robot, robot.substeps * model.opt.timestep),
+        patience=patience_of(robot, bounds, full_speed_energy(model, joints, robot)),
+        interface=robot.interface,
+        homing=robot.calibration.homing,
+        gripper=gripper,
         wrist=wrist,
         hand=hand,
-        patience=patience_of(robot, bounds, data.energy[1]),
-        interface=robot.interface,
+        bodies=bodies,
+        object_qpos=model.jnt_qposadr[lookup.free_joints(model, objects)].astype(int),
+        mocap=lookup.mocap_ids(model, obstacles),
+        geoms=find_geoms(model, scene, moved, linked, objects, wrist),
     )
+
+
+def find_geoms(
+    model: mujoco.MjModel,
+    scene: SceneConfig,
+    moved: Mask,
+    linked: Mask,
+    objects: Ints,
+    wrist: Wrist | None,
+) -> CellGeoms:
+    """Return the geoms of a cell, and which of their contacts are unintended.
+
+    Contacts of an object with a support or the gripper, between parts of one object, and between
+    fingers are intended. Contacts of what hangs on a wrist sensor with a support are, too, because
+    the sensor measures them. Every other contact of arm or object is unintended. Contacts between
+    other geoms are ignored.
+
+    Args:
+        model: The compiled model.
+        scene: Names the supports.
+        moved: (nbody,), the bodies that the arm moves.
+        linked: (nbody,), the bodies of the gripper.
+        objects: Ids of the bodies of the objects.
+        wrist: The force/torque sensor. None if the arm has none.
+
+    Raises:
+        RobotError: A support is missing.
+    """
+    arm = lookup.geoms_of(model, moved)
+    gripper = lookup.geoms_of(model, linked)
+    loose = lookup.geoms_of(model, lookup.below(model, objects))
+    supports = lookup.find_all(model, mujoco.mjtObj.mjOBJ_GEOM, scene.supports, "scene.supports")
+    touch = np.zeros((model.ngeom, model.ngeom), dtype=bool)
+    judged = np.union1d(arm, loose)
+    touch[judged, :] = touch[:, judged] = True
+    intended = [(loose, supports), (loose, gripper), (gripper, gripper)]
+    if wrist is not None:
+        sensed = lookup.below(model, model.site_bodyid[[wrist.site]])
+        intended.append((lookup.geoms_of(model, sensed), supports))
+    for first, second in intended:
+        touch[np.ix_(first, second)] = touch[np.ix_(second, first)] = False
+    root = model.body_rootid[model.geom_bodyid]
+    touch[np.ix_(loose, loose)] &= root[loose][:, None] != root[loose][None, :]
+    return CellGeoms(arm, gripper, supports, touch)
+
+
+def full_speed_energy(model: mujoco.MjModel, joints: Ints, robot: RobotConfig) -> float:
+    """Return the kinetic energy of the arm at home with all joints at full speed, J."""
+    data = mujoco.MjData(model)
+    data.qpos[model.jnt_qposadr[joints]] = robot.home
+    data.qvel[model.jnt_dofadr[joints]] = robot.velocity
+    mujoco.mj_fwdPosition(model, data)
+    mujoco.mj_energyVel(model, data)
+    return float(data.energy[1])
 
 
 def find_gripper(
     model: mujoco.MjModel, robot: RobotConfig, moved: Mask, arm: Ints
 ) -> tuple[Gripper | None, Mask]:
-    """Return the gripper, and mark its bodies.
+    """Find the gripper and its bodies.
 
-    These are the body that carries its linkage, and all below it: the driven joint may be anywhere
-    in the linkage.
+    The bodies are the body that carries the linkage and all its descendants. The driven joint may
+    be anywhere in the linkage.
 
     Args:
         model: The compiled model.
-        robot: The config.
-        moved: (nbody,), the bodies that the arm moves.
-        arm: The joints of the arm, none of which is part of the linkage.
+        robot: The `[robot]` table.
+        moved: The bodies that the arm moves, (nbody,).
+        arm: Joints of the arm, none of which is part of the linkage.
 
     Returns:
-        None and no body, if the arm has no gripper.
+        The gripper, and a mask of its bodies, (nbody,). None and no body if the arm has no gripper.
 
     Raises:
-        RobotError: The arm does not carry the gripper's joint, or its linkage cannot be solved.
+        RobotError: The arm does not carry the gripper's joint, or the linkage cannot be solved.
     """
     config = robot.gripper
     if config is None:
         return None, np.zeros(model.nbody, dtype=bool)
     name = config.joint
     joint = lookup.find(model, mujoco.mjtObj.mjOBJ_JOINT, name, "robot.gripper.joint")
-    if name in robot.joints or not moved[model.jnt_bodyid[joint]]:
-        raise RobotError(
-            f"robot.gripper.joint: '{name}' must be a joint that the arm carries, not one of the"
-            " arm's own"
-        )
     body = model.jnt_bodyid[joint]
+    if name in robot.joints or not moved[body]:
+        raise RobotError(
+            f"robot.gripper.joint: '{name}' must be a joint that the arm carries, and not be in"
+            " robot.joints"
+        )
     while (
         (parent := model.body_parentid[body])
         and model.body_jntnum[parent]
@@ -270,32 +353,13 @@ def find_gripper(
     return gripper, linked
 
 
-def unintended_pairs(
-    model: mujoco.MjModel,
-    arm: Ints,
-    gripper: Ints,
-    objects: Ints,
-    supports: Ints,
-) -> Mask:
-    """Return (ngeom, ngeom), True where a contact of two geoms is unintended.
-
-    Intended are an object on a support, an object in the gripper, the parts of one object and the
-    fingers on each other. Every other contact of arm or object is unintended; the rest of the cell
-    is ignored.
-    """
-    touch = np.zeros((model.ngeom, model.ngeom), dtype=bool)
-    ours = np.union1d(arm, objects)
-    touch[ours, :] = touch[:, ours] = True
-    for first, second in ((objects, supports), (objects, gripper), (gripper, gripper)):
-        touch[np.ix_(first, second)] = touch[np.ix_(second, first)] = False
-    root = model.body_rootid[model.geom_bodyid]
-    touch[np.ix_(objects, objects)] &= root[objects][:, None] != root[objects][None, :]
-    return touch
-
-
 def unintended_contacts(data: mujoco.MjData, touch: Mask, within: float = 0.0) -> NDArray[np.int32]:
-    """Return the pairs of geoms, (n, 2), in unintended contact, or `within` a distance, m; `touch`
-    is that of `Cell`.
+    """Return the pairs of geoms that are in unintended contact, (n, 2).
+
+    Args:
+        data: Data of the model.
+        touch: See `CellGeoms`.
+        within: Distance below which geoms count as in contact, m.
     """
     contact = data.contact
     pairs: NDArray[np.int32] = contact.geom
@@ -303,12 +367,21 @@ def unintended_contacts(data: mujoco.MjData, touch: Mask, within: float = 0.0) -
 
 
 def ease_gripper(cell: Cell, spec: mujoco.MjSpec, config: GripperConfig, tick_s: float) -> bool:
-    """Change in `spec` what would keep the gripper from moving; return whether something did.
+    """Change the model where it would keep the gripper from moving.
 
-    Its links that overlap before its fingers meet, open or half open, do not touch: links meet at
-    their pins, and meshes are simulated by their hulls. A drive lighter than what the damping of
-    its loop stops within one tick would swing: it gets that inertia, as `min_armature` does for the
-    arm's joints.
+    Links that overlap when the gripper is open or half open, before its fingers meet, are excluded
+    from contact. They overlap because links meet at their pins, and because meshes are simulated by
+    their convex hulls. A drive whose inertia is too small for the damping of its loop would
+    oscillate. It gets the inertia that it lacks, as `min_armature` does for the joints of the arm.
+
+    Args:
+        cell: The cell, with a gripper.
+        spec: The model, which is changed.
+        config: The `[robot.gripper]` table.
+        tick_s: Duration of a tick, s.
+
+    Returns:
+        True if anything was changed.
     """
     model = cell.model
     gripper = cell.gripper
@@ -319,21 +392,23 @@ def ease_gripper(cell: Cell, spec: mujoco.MjSpec, config: GripperConfig, tick_s:
         gripper.linkage.set(data.qpos, opening)
         mujoco.mj_fwdPosition(model, data)
         contact = data.contact
-        ours = np.isin(contact.geom, cell.gripper_geoms).all(axis=1) & (contact.dist < 0.0)
-        overlaps |= {tuple(sorted(pair)) for pair in model.geom_bodyid[contact.geom[ours]].tolist()}
+        overlap = np.isin(contact.geom, cell.geoms.gripper).all(axis=1) & (contact.dist < 0.0)
+        bodies = model.geom_bodyid[contact.geom[overlap]].tolist()
+        overlaps |= set(map(tuple, map(sorted, bodies)))
     names = [[model.body(body).name for body in pair] for pair in sorted(overlaps)]
-    named = [pair for pair in names if all(pair)]
+    named = [*filter(all, names)]
     for first, second in named:
         spec.add_exclude(bodyname1=first, bodyname2=second)
-    lacks = config.gains[1] * tick_s - float(model.dof_M0[gripper.dof])
-    if lacks > 0.0:
-        spec.joint(config.joint).armature += lacks
-    return bool(named) or lacks > 0.0
+    missing = config.gains[1] * tick_s - float(model.dof_M0[gripper.dof])  # kg or kg m2
+    if missing > 0.0:
+        spec.joint(config.joint).armature += missing
+    return bool(named) or missing > 0.0
 
 
 def start_qpos(cell: Cell, position: Array) -> Array:
-    """Return qpos of a start: arm at `position`, gripper and its linkage open, the rest as in the
-    model.
+    """Return qpos of a start, with the arm at `position`.
+
+    The gripper and its linkage are open, and all else is as in the model.
     """
     qpos = np.array(cell.model.qpos0)
     qpos[cell.qpos] = position
@@ -343,32 +418,41 @@ def start_qpos(cell: Cell, position: Array) -> Array:
 
 
 def check_start(cell: Cell, robot: RobotConfig, key: str, position: Array) -> None:
-    """Raise `RobotError` when the start at robot.`key` is outside the limits, too heavy to hold, in
-    unintended contact, or not finite.
+    """Check that the arm can start at a position.
+
+    Args:
+        cell: The cell, whose keyframe is at this position.
+        robot: The `[robot]` table.
+        key: Key of the position in the table, for the error.
+        position: The position, (joints,), rad.
+
+    Raises:
+        RobotError: The position is outside the limits, too heavy to hold, in unintended contact, or
+            has an acceleration that is not finite.
     """
     for name, q, (low, high) in zip(robot.joints, position, cell.limits.position, strict=True):
         if not low <= q <= high:
             raise RobotError(
-                f"robot.{key}: joint '{name}' at {q:g} rad; {low:g} to {high:g} is valid"
+                f"robot.{key}: joint '{name}' is at {q:g} rad; it must be {low:g} to {high:g}"
             )
     data = cell.start()
     if not np.isfinite(data.qacc).all():
         raise RobotError(
-            f"model '{robot.model}': acceleration at {key} is not finite; check masses, inertias,"
-            " gravity"
+            f"model '{robot.model}': the acceleration at {key} is not finite; check masses,"
+            " inertias, gravity"
         )
     load = np.abs(data.qfrc_bias - data.qfrc_passive)[cell.dof]
     for name, needed, limit in zip(robot.joints, load, cell.bounds.torque, strict=True):
         if needed > limit:
             raise RobotError(
-                f"robot.{key}: joint '{name}' carries {needed:.4g} N m there; its torque limit is"
+                f"robot.{key}: joint '{name}' needs {needed:.4g} N m to hold; its torque limit is"
                 f" {limit:g}"
             )
-    # Surfaces that meet at 0.0 mm do not touch yet, but in the first motion.
-    near = copy(cell.model)
-    set_margins(near, near.geom_margin + TOUCHING_M)
-    data = replace(cell, model=near).start()
-    for pair in unintended_contacts(data, cell.touch, TOUCHING_M):
+    # Surfaces at a distance of 0.0 mm do not touch yet, but would in the first motion.
+    padded = copy(cell.model)
+    set_margins(padded, padded.geom_margin + TOUCHING_M)
+    data = replace(cell, model=padded).start()
+    for pair in unintended_contacts(data, cell.geoms.touch, TOUCHING_M):
         first, second = (lookup.geom_name(cell.model, geom) for geom in pair)
         raise RobotError(
             f"robot.{key}: '{first}' touches '{second}'; move {key} or the object, name a support,"
@@ -377,37 +461,44 @@ def check_start(cell: Cell, robot: RobotConfig, key: str, position: Array) -> No
 
 
 def check_fingers(cell: Cell, config: GripperConfig) -> None:
-    """Raise `RobotError` when couplings yield so far that open or closing fingers settle beyond
-    `config.residual` of where planning poses them, or the gripper does not close.
+    """Check that the gripper opens and closes, with fingers near where planning expects them.
+
+    Only grippers whose couplings yield are simulated.
+
+    Raises:
+        RobotError: The gripper does not open or close, or fingers settle farther than
+            `config.residual` from their planned pose.
     """
     gripper = cell.gripper
     if gripper is None or not gripper.linkage.yields:
         return
     model = cell.model
     stiffness, damping = config.gains
-    for wanted, start in ((config.open, config.open), (config.closed, half_open(config))):
+    for goal, start in ((config.open, config.open), (config.closed, half_open(config))):
         data = cell.start()
         gripper.linkage.set(data.qpos, start)
         for _ in range(round(SETTLING_S / model.opt.timestep)):
             data.qpos[cell.qpos] = cell.home
             data.qvel[cell.dof] = 0.0
             opening = float(data.qpos[gripper.linkage.driven])
-            pull = stiffness * (wanted - opening) - damping * data.qvel[gripper.dof]
+            pull = stiffness * (goal - opening) - damping * data.qvel[gripper.dof]
             data.ctrl[gripper.actuator] = np.clip(pull, -config.force, config.force)
             mujoco.mj_step(model, data)
-        if not abs(opening - wanted) <= abs(start - wanted) + config.still:
+        if not abs(opening - goal) <= abs(start - goal) + config.still:
             raise RobotError(
-                f"robot.gripper.force: {config.force:g} does not bring the gripper from"
-                f" {start:.4g} to {wanted:.4g}: it settles at {opening:.4g}"
+                f"robot.gripper.force: {config.force:g} does not move the gripper from"
+                f" {start:.4g} to {goal:.4g}: it settles at {opening:.4g}"
             )
-        settled = data.geom_xpos[cell.gripper_geoms].copy()
+        settled = data.geom_xpos[cell.geoms.gripper].copy()
         gripper.linkage.set(data.qpos, float(data.qpos[gripper.linkage.driven]))
         mujoco.mj_kinematics(model, data)
-        away = float(np.max(np.linalg.norm(data.geom_xpos[cell.gripper_geoms] - settled, axis=1)))
-        if not away <= config.residual:
+        error_m = float(
+            np.max(np.linalg.norm(data.geom_xpos[cell.geoms.gripper] - settled, axis=1))
+        )
+        if not error_m <= config.residual:
             raise RobotError(
-                f"robot.gripper: its couplings yield: at {opening:.4g} a finger settles"
-                f" {away * 1e3:.1f} mm from where planning poses it; robot.gripper.residual permits"
+                f"robot.gripper: couplings yield: at {opening:.4g} a finger settles"
+                f" {error_m * 1e3:.1f} mm from its planned pose; robot.gripper.residual permits"
                 f" {config.residual * 1e3:.1f} mm"
             )
 

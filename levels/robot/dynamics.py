@@ -1,8 +1,8 @@
-"""The arm's equation of motion, as a controller knows it: torque = M(q) qdd + bias(q, qd) +
-friction.
+"""The arm's equation of motion for controllers: torque = M(q) qdd + bias(q, qd) + friction.
 
-Evaluated on separate data, with contacts and constraints off: a pure function of its arguments, not
-of a simulation. (`qfrc_bias` of a simulation belongs to the state before its last step.)
+It is evaluated on separate data, with contacts and constraints off. It is therefore a pure function
+of its arguments, independent of any simulation. (`qfrc_bias` of a simulation belongs to the state
+before its last step.)
 """
 
 from __future__ import annotations
@@ -32,8 +32,10 @@ from rack.levels.robot.engine import (
 )
 
 FRICTION_SPEED = 0.01
-"""Joint speed, rad/s, at which 3/4 of the dry friction is fed forward: a step at zero speed would
-excite the arm."""
+"""Joint speed at which 3/4 of the dry friction is fed forward, rad/s.
+
+A step at zero speed would excite the arm.
+"""
 
 OFF = (
     mujoco.mjtDisableBit.mjDSBL_CONTACT
@@ -43,14 +45,14 @@ OFF = (
 
 
 class Payload(NamedTuple):
-    """A mass in the gripper."""
+    """Mass in the gripper."""
 
     mass: float  # kg
-    offset: Array  # (3,), m: its centre in the tool's frame
+    offset: Array  # (3,), m: centre of mass in the tool's frame
 
 
 class Terms(NamedTuple):
-    """The equation at one state; dry friction is separate."""
+    """Terms of the equation of motion at one state, without dry friction."""
 
     inertia: Array  # (joints, joints), kg m2
     # (joints,), N m: gravity, Coriolis and centrifugal torques, springs, viscous friction
@@ -60,12 +62,13 @@ class Terms(NamedTuple):
 STATE_ROWS = 2
 BIAS_ROW = 2
 INERTIA_ROW = 3
-"""An evaluation is one array, (3 + joints, joints): position, velocity, bias, inertia."""
+"""Rows of an evaluation, (3 + joints, joints): position, velocity, bias, inertia."""
 
 
 class Dynamics:
-    """Evaluates the equation of motion of a cell's arm, its fingers open; the same state again
-    costs nothing.
+    """Evaluates the equation of motion of a cell's arm, with open fingers.
+
+    Repeating an evaluation at the same state takes no time.
     """
 
     def __init__(self, cell: Cell) -> None:
@@ -75,15 +78,14 @@ class Dynamics:
         self._data = d = mujoco.MjData(self._model)
         mujoco.mj_resetDataKeyframe(self._model, d, 0)
         joints = len(cell.dof)
-        # One array, and not eight, for the compiled functions: each costs more than the arithmetic
-        # on it.
+        # Compiled functions take one array instead of eight, because passing an array costs more
+        # than the arithmetic on it.
         self._evaluations = np.zeros((2, INERTIA_ROW + joints, joints))
-        self.newest, given = (
-            self._evaluations
-        )  # the first is not to be written to, the second has the payload
-        self.newest[:STATE_ROWS] = np.nan  # there is none
-        self._terms = Terms(given[INERTIA_ROW:], given[BIAS_ROW])
-        self._position, self._velocity = given[:STATE_ROWS]
+        # The first is read only for users, the second includes the payload.
+        self.newest, current = self._evaluations
+        self.newest[:STATE_ROWS] = np.nan  # not evaluated yet
+        self._terms = Terms(current[INERTIA_ROW:], current[BIAS_ROW])
+        self._position, self._velocity = current[:STATE_ROWS]
         self._offset = np.zeros(3)
         at = self._model._address, d._address
         self._evaluating = *at, *addresses(self._model, d, cell), self._evaluations
@@ -91,14 +93,18 @@ class Dynamics:
         tool = (d.site_xpos[cell.tool], d.site_xmat[cell.tool])
         gravity = np.array(self._model.opt.gravity)
         jacobians = np.zeros((2, 3, cell.model.nv))
-        self._carrying = self._offset, *at, cell.dof, hand, *tool, gravity, jacobians, given
+        self._carrying = self._offset, *at, cell.dof, hand, *tool, gravity, jacobians, current
         self._evaluate = evaluate.load()
         self._carry = carry.load()
         self.dry = np.array(cell.model.dof_frictionloss[cell.dof])  # (joints,), N m: dry friction
 
     def terms(self, q: Array, qd: Array, payload: Payload | None = None) -> Terms:
-        """Return the terms at `q`, rad, and `qd`, rad/s, (joints,) each. The arrays are valid until
-        the next call.
+        """Return the terms at a state. The arrays are valid until the next call.
+
+        Args:
+            q: Positions, (joints,), rad.
+            qd: Velocities, (joints,), rad/s.
+            payload: Mass in the gripper. None if it is empty.
         """
         self._position[:] = q
         self._velocity[:] = qd
@@ -114,31 +120,33 @@ class Dynamics:
         return self._model, self._data
 
     def friction(self, velocity: Array) -> Array:
-        """Return dry friction, N m, that opposes motion at `velocity`, rad/s, (joints,)."""
+        """Return the dry friction that opposes motion at `velocity`, rad/s, (joints,), N m."""
         return np.asarray(self.dry * each(math.tanh, velocity / FRICTION_SPEED))
 
 
 def addresses(
     model: mujoco.MjModel, data: mujoco.MjData, cell: Cell
 ) -> tuple[NDArray[np.int64], Array]:
-    """Return where an evaluation reads and writes, (4 + joints, joints), and the memory of `data`
-    that this indexes.
+    """Return the places in MuJoCo's memory that an evaluation reads and writes.
 
-    The rows are position, velocity, bias, passive force, and those of the inertia: -1 where it is
-    always zero.
+    Returns:
+        Indices, (4 + joints, joints), and the memory of `data` that they refer to. The rows are
+        position, velocity, bias, passive force, and the rows of the inertia, with -1 for elements
+        that are always zero.
     """
     memory, (qpos, qvel, bias, passive, inertia) = one_view(
         data.qpos, data.qvel, data.qfrc_bias, data.qfrc_passive, data.M
     )
-    below = np.full(
-        (model.nv, model.nv), -1
-    )  # MuJoCo keeps what is not zero of a lower triangle, row by row
+    # MuJoCo stores the nonzero elements of the lower triangle, row by row.
+    lower = np.full((model.nv, model.nv), -1)
     for row, (first, count) in enumerate(zip(model.M_rowadr, model.M_rownnz, strict=True)):
         entries = np.arange(first, first + count)
-        below[row, model.M_colind[entries]] = inertia + entries
-    whole = np.maximum(below, below.T)[np.ix_(cell.dof, cell.dof)]
+        lower[row, model.M_colind[entries]] = inertia + entries
+    symmetric = np.maximum(lower, lower.T)[np.ix_(cell.dof, cell.dof)]
     return (
-        np.vstack((qpos + cell.qpos, qvel + cell.dof, bias + cell.dof, passive + cell.dof, whole)),
+        np.vstack(
+            (qpos + cell.qpos, qvel + cell.dof, bias + cell.dof, passive + cell.dof, symmetric)
+        ),
         memory,
     )
 
@@ -147,24 +155,26 @@ def addresses(
 def evaluate(
     model: int, data: int, places: NDArray[np.int64], memory: Array, evaluations: Array
 ) -> None:
-    """Evaluate the equation at the state in the second of `evaluations`, unless the first is of
-    that state already.
+    """Evaluate the equation of motion, unless it has been evaluated at the same state.
 
-    Both are (3 + joints, joints), and equal afterwards; `places` are addresses in `memory`, see
-    `addresses`.
+    Args:
+        model: Address of the model.
+        data: Address of the data.
+        places: Indices in `memory`, see `find_places`.
+        memory: Memory of the data.
+        evaluations: (2, 3 + joints, joints). The second holds the state; the first is the last
+            evaluation. Both are equal afterwards.
     """
-    newest = evaluations[0]
-    given = evaluations[1]
+    newest, current = evaluations
     joints = places.shape[1]
     same = True
     for row in range(STATE_ROWS):
         for joint in range(joints):
-            same &= newest[row, joint] == given[row, joint]
-            newest[row, joint] = memory[places[row, joint]] = given[row, joint]
+            same &= newest[row, joint] == current[row, joint]
+            newest[row, joint] = memory[places[row, joint]] = current[row, joint]
     if not same:
-        mj_kinematics(
-            model, data
-        )  # with the next five, all that `mj_fwdPosition` does for inertia and bias
+        # These six are all steps of `mj_fwdPosition` that inertia and bias need.
+        mj_kinematics(model, data)
         mj_com_pos(model, data)
         mj_flex(model, data)
         mj_tendon(model, data)
@@ -176,11 +186,11 @@ def evaluate(
             for other in range(joints):
                 place = places[4 + joint, other]
                 newest[INERTIA_ROW + joint, other] = memory[place] if place >= 0 else 0.0
-    given[BIAS_ROW:] = newest[BIAS_ROW:]
+    current[BIAS_ROW:] = newest[BIAS_ROW:]
 
 
 @compiled_for("f8, f8[::1], i8, i8, i8[::1], i8, f8[::1], f8[::1], f8[::1], f8[:,:,::1], f8[:,::1]")
-def carry(  # noqa: PLR0913  # flat, as `advance` in levels/arm/substeps.py
+def carry(  # noqa: PLR0913  # flat, as `make_steps` in levels/arm/substeps.py
     mass: float,
     offset: Array,
     model: int,
@@ -193,7 +203,21 @@ def carry(  # noqa: PLR0913  # flat, as `advance` in levels/arm/substeps.py
     jacobians: Array,
     evaluation: Array,
 ) -> None:
-    """Add a point mass at the tool: m J^T J to the inertia, m J^T (Jdot qd - g) to the bias."""
+    """Add a point mass at the tool: m J^T J to the inertia, m J^T (Jdot qd - g) to the bias.
+
+    Args:
+        mass: Mass, kg.
+        offset: Its centre in the tool's frame, (3,), m.
+        model: Address of the model.
+        data: Address of the data.
+        dof: Addresses of the joints in qvel.
+        hand: Body of the tool.
+        tool: Position of the tool, (3,), m.
+        turned: Rotation matrix of the tool, (9,).
+        gravity: (3,), m/s2.
+        jacobians: Work space, (2, 3, nv).
+        evaluation: The evaluation to change, (3 + joints, joints).
+    """
     velocity = evaluation[1]
     bias = evaluation[BIAS_ROW]
     inertia = evaluation[INERTIA_ROW:]

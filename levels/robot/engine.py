@@ -1,17 +1,17 @@
-"""MuJoCo's own functions and memory, for compiled code.
+"""MuJoCo's functions and memory, for compiled code.
 
-Called from Python, a step of MuJoCo costs 2 us more than it takes, and a look at its contacts half
-a microsecond: both happen at every step. Compiled code calls the C library directly, on the
-addresses of model and data. Called as Python, the same code reaches the same functions through
+Called from Python, a MuJoCo step costs 2 us more than it takes, and reading its contacts costs half
+a microsecond; both happen in every step. Compiled code calls the C library directly, with the
+addresses of model and data. The same code called as Python reaches the same functions through
 ctypes.
 
-Of an error that MuJoCo calls fatal (its memory is exhausted) the bindings would make an exception;
-here it ends the process, as the exception would have ended the board.
+If MuJoCo reports a fatal error (its memory is exhausted), the Python bindings raise an exception.
+Here the error ends the process, which the exception would have done as well.
 
-The state of a simulation is everything that its next step depends on. MuJoCo's integration state
-does not say which bodies sleep, so that follows it. What lies at rest sleeps until something awake
-touches it: in `nasrem` its blocks take two thirds of the time of a step while they are awake. A
-simulation restored from this state continues bit for bit, asleep or awake.
+The state of a simulation is everything on which its next step depends. MuJoCo's integration state
+does not contain which bodies sleep, so that is appended to it. Bodies at rest sleep until something
+awake touches them. In `nasrem` the blocks take two thirds of the time of a step while they are
+awake. A simulation restored from this state continues bit for bit, asleep or awake.
 """
 
 from __future__ import annotations
@@ -33,9 +33,10 @@ SLEEP = int(mujoco.mjtEnableBit.mjENBL_SLEEP)
 LIBRARY = Path(mujoco.__file__).with_name(f"libmujoco.so.{mujoco.mj_versionString()}")
 
 
-class native(compiled[..., None]):  # noqa: N801  # stands for a function
-    """A function of MuJoCo that returns nothing. Arguments are integers: addresses, sizes and
-    flags.
+class native(compiled[..., None]):  # noqa: N801  # used like a function
+    """A function of MuJoCo that returns nothing.
+
+    Its arguments are integers: addresses, sizes and flags.
     """
 
     def __init__(self, name: str, arguments: int) -> None:
@@ -59,7 +60,7 @@ class native(compiled[..., None]):  # noqa: N801  # stands for a function
         return self._machine
 
     def source(self) -> Iterator[bytes]:
-        """Yield what a caller's code depends on: it finds the function by name."""
+        """Yield the name and the number of arguments, which determine the calling code."""
         yield repr((self._name, self._arguments)).encode()
 
 
@@ -82,36 +83,42 @@ mj_update_sleep = native("mj_updateSleep", 2)
 
 
 def state_size(model: mujoco.MjModel) -> int:
-    """Return the length of a state."""
+    """Return the length of the state of a simulation."""
     return int(mujoco.mj_stateSize(model, INTEGRATION)) + int(model.ntree)
 
 
 def view_state(model: mujoco.MjModel, data: mujoco.MjData, state: Array) -> None:
-    """Set `data`, of which nothing sleeps, to a state but for sleep: enough to look at it."""
+    """Set `data` to a state without its sleep, which is enough to read poses from it.
+
+    No body of `data` may sleep.
+    """
     end = mujoco.mj_stateSize(model, INTEGRATION)
     mujoco.mj_setState(model, data, np.ascontiguousarray(state[:end]), INTEGRATION)
 
 
 def one_view(*arrays: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Return the memory from the first to the last of some arrays of one `MjData`, and where in it
-    each begins.
+    """Return one view of memory that contains several arrays of one `MjData`.
 
     It is valid as long as the data.
+
+    Returns:
+        The view, and the index in it at which each array begins.
     """
     begins = np.array([array.ctypes.data for array in arrays])
     ends = [int(begin) + array.nbytes for begin, array in zip(begins, arrays, strict=True)]
-    first = int(begins.min())
+    start = int(begins.min())
     item = np.dtype(np.float64).itemsize
     return (
-        _view(first, np.float64, ((max(ends) - first) // item,), (item,)),
-        (begins - first) // item,
+        _view(start, np.float64, ((max(ends) - start) // item,), (item,)),
+        (begins - start) // item,
     )
 
 
 def set_margins(model: mujoco.MjModel, margins: ArrayLike) -> None:
-    """Have geoms find each other at the sum of their `margins`, (geoms,) or one for all, m.
+    """Set the margins of geoms, so that MuJoCo finds pairs within the sum of their margins.
 
-    MuJoCo rules out bodies first, by margins of their own, which its compiler sets.
+    MuJoCo first excludes pairs of bodies, by margins of bodies that its compiler sets. Therefore
+    these are set as well. `margins` is (geoms,), or one value for all, m.
     """
     model.geom_margin[:] = margins
     model.body_margin[:] = 0.0
@@ -119,19 +126,22 @@ def set_margins(model: mujoco.MjModel, margins: ArrayLike) -> None:
 
 
 class ContactViews(NamedTuple):
-    """Views of the contacts of an `MjData`, valid as long as it is."""
+    """Views of the contacts of an `MjData`, valid as long as the data."""
 
     number: NDArray[np.int32]  # (1,)
-    geoms: NDArray[np.int32]  # (room, 2), of which the first `number` are contacts
-    distance: Array  # (room,), m; likewise
+    geoms: NDArray[np.int32]  # (capacity, 2), of which the first `number` are contacts
+    distance: Array  # (capacity,), m; likewise
 
 
 def contact_views(model: mujoco.MjModel, data: mujoco.MjData) -> ContactViews:
-    """Return views of the contacts. Raises `RuntimeError` for a MuJoCo that keeps them in another
-    place.
+    """Return views of the contacts.
 
-    The bindings give a copy of their number, and views of the contacts of one moment. But contacts
-    always begin the arena, and their number follows warnings and timers (mjdata.h).
+    The bindings give a copy of their number, and views that are valid only until the contacts
+    change. But contacts are always at the start of the arena, and their number follows warnings and
+    timers (mjdata.h).
+
+    Raises:
+        RuntimeError: This version of MuJoCo stores the number of contacts elsewhere.
     """
     state = np.zeros(mujoco.mj_stateSize(model, INTEGRATION))
     mujoco.mj_getState(model, data, state, INTEGRATION)
@@ -140,24 +150,23 @@ def contact_views(model: mujoco.MjModel, data: mujoco.MjData) -> ContactViews:
     end = warnings.ctypes.data - warnings.itemsize + len(warnings) * warnings.strides[0]
     number = _view(end + len(timers) * timers.strides[0], np.int32, (1,), (4,))
     before = int(number[0])
-    mujoco.mj_addContact(
-        model, data, mujoco.MjContact()
-    )  # where there are no contacts, they have no address
+    # Without any contact, the arrays of contacts have no address.
+    mujoco.mj_addContact(model, data, mujoco.MjContact())
     if not before + 1 == number[0] == data.ncon:
         raise RuntimeError(
-            f"MuJoCo {mujoco.mj_versionString()} does not keep the number of contacts where 4.0"
+            f"MuJoCo {mujoco.mj_versionString()} does not store the number of contacts where 4.0"
             " does"
         )
     geoms = data.contact.geom
     distance = data.contact.dist
-    room = data.narena // geoms.strides[0]
+    capacity = data.narena // geoms.strides[0]
     strides = geoms.strides
     views = ContactViews(
         number,
-        _view(geoms.ctypes.data, np.int32, (room, 2), strides),
-        _view(distance.ctypes.data, np.float64, (room,), strides[:1]),
+        _view(geoms.ctypes.data, np.int32, (capacity, 2), strides),
+        _view(distance.ctypes.data, np.float64, (capacity,), strides[:1]),
     )
-    mujoco.mj_forward(model, data)  # without the contact added
+    mujoco.mj_forward(model, data)  # removes the added contact
     mujoco.mj_setState(model, data, state, INTEGRATION)
     return views
 
@@ -165,6 +174,6 @@ def contact_views(model: mujoco.MjModel, data: mujoco.MjData) -> ContactViews:
 def _view(
     address: int, kind: type, shape: tuple[int, ...], strides: tuple[int, ...]
 ) -> NDArray[Any]:
-    """Return the array at `address`."""
+    """Return an array of the memory at `address`."""
     memory = (ctypes.c_char * (shape[0] * strides[0])).from_address(address)
     return np.ndarray(shape, kind, memoryview(memory), 0, strides)

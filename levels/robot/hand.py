@@ -1,8 +1,9 @@
 """A hand: fingers whose joints are driven by pairs of tendons, from `[robot.hand]` and its model.
 
-The tension of a tendon is the control of its actuator. A positive one shortens the tendon, and none
-can be negative: so it can only pull. The two of a joint pull it opposite ways, over equal arms that
-do not vary, and turn no other joint: torque = arm (flexor's tension - extensor's).
+The control of a tendon's actuator is its tension. A positive tension shortens the tendon, and it
+cannot be negative: a tendon can only pull. The two tendons of a joint pull in opposite directions,
+with equal and constant moment arms, and turn no other joint: torque = arm (tension of flexor -
+tension of extensor).
 """
 
 from __future__ import annotations
@@ -20,69 +21,76 @@ from rack.levels.robot.model import drives_arm, listed, remove
 from rack.levels.tables import FingerConfig, HandConfig, RobotConfig
 
 SAME_ARM = 1e-6
-"""Part of a moment arm by which it may vary: rounding."""
+"""Fraction by which a moment arm may vary, to allow for rounding."""
 ROWS = ("flexors", "extensors")
 NET_FORCE = 1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 3, 1
-"""Parameters of a contact sensor: its data are the force, net of all contacts, once."""
+"""Parameters of a contact sensor that measures the net force of all contacts."""
 
 
 @dataclass(frozen=True)
 class Hand:
-    """The hand of a cell. Vectors of joints are in the order of `robot.joints`, rows of two:
-    flexors, extensors.
+    """The hand of a cell.
+
+    Joints are in the order of `robot.joints`. Where there are two rows, they are flexors and
+    extensors.
     """
 
-    names: tuple[str, ...]  # of the fingers
+    names: tuple[str, ...]  # names of the fingers
     tips: Ints  # (fingers,), sites at their tips
-    # (fingers, 3), in sensordata: of contacts on the body of the tip, in the world's frame
+    # (fingers, 3), addresses in sensordata of the force on the body of the tip, in the world frame.
     forces: Ints
-    fingers: Mask  # (fingers, joints), True where a joint is the finger's
-    actuators: Ints  # (2, joints), of the tendons, in ctrl
-    arms: Array  # (joints,), m: of both tendons of a joint, without sign
-    least: float  # N: below it, a tendon is slack
+    fingers: Mask  # (fingers, joints), True where a joint belongs to the finger
+    actuators: Ints  # (2, joints), addresses of the tendons in ctrl
+    arms: Array  # (joints,), m: moment arm of both tendons of a joint, positive
+    least: float  # N: tension below which a tendon is slack
     rest: float  # N: mean tension of a pair at rest
     most: Array  # (joints,), N: largest tension of either tendon
     closed: float  # N/m: stiffness of a tendon whose valve is closed
 
     @property
     def torque(self) -> Array:
-        """Largest torque of a joint either way, (joints,), N m: one tendon at most, the other at
-        least.
+        """Largest torque of a joint in both directions, (joints,), N m.
+
+        One tendon then has its largest tension, and the other the least.
         """
         return np.asarray(self.arms * self.most - self.arms * self.least)
 
 
 def check_hand(robot: RobotConfig, hand: HandConfig) -> None:
-    """Raise `RobotError` for a mistake of `[robot.hand]` in itself: lengths of lists, joints of
-    fingers, tensions.
+    """Check `[robot.hand]` by itself: lengths of lists, joints of fingers, tensions.
+
+    Raises:
+        RobotError: There is a mistake.
     """
     if robot.gripper is not None:
         raise RobotError(
-            "robot.hand: a hand stands in place of an arm and has no gripper; leave out"
+            "robot.hand: a hand takes the place of an arm and cannot have a gripper; remove"
             " robot.gripper"
         )
     if robot.torque is not None:
-        raise RobotError("robot.torque: torques of a hand follow from its tendons; leave it out")
+        raise RobotError("robot.torque: torques of a hand follow from its tendons; remove the key")
     for row in ROWS:
-        given = getattr(hand, row)
-        if len(given) != len(robot.joints):
+        names = getattr(hand, row)
+        if len(names) != len(robot.joints):
             raise RobotError(
-                f"robot.hand.{row}: {len(given)} values; one per joint: {len(robot.joints)}"
+                f"robot.hand.{row}: has {len(names)} values but needs {len(robot.joints)},"
+                " one per joint"
             )
     both = hand.flexors + hand.extensors
     for name in both:
         if both.count(name) > 1:
             raise RobotError(
-                f"robot.hand: actuator '{name}' is named {both.count(name)} times; once is valid"
+                f"robot.hand: actuator '{name}' is named {both.count(name)} times instead of once"
             )
     _check_fingers(robot, hand)
     if not hand.least < hand.rest:
         raise RobotError(
-            f"robot.hand.rest: {hand.rest:g} N; above robot.hand.least = {hand.least:g} N is valid"
+            f"robot.hand.rest: {hand.rest:g} N must be above robot.hand.least, {hand.least:g} N"
         )
 
 
 def _check_fingers(robot: RobotConfig, hand: HandConfig) -> None:
+    """Check that fingers have distinct names, and that each joint belongs to one finger."""
     names = [finger.name for finger in hand.finger]
     for finger in hand.finger:
         if names.count(finger.name) > 1:
@@ -97,23 +105,35 @@ def _check_fingers(robot: RobotConfig, hand: HandConfig) -> None:
                     f" {have}"
                 )
     for joint in robot.joints:
-        owners = [finger.name for finger in hand.finger for own in finger.joints if own == joint]
+        owners = [
+            finger.name
+            for finger in hand.finger
+            for finger_joint in finger.joints
+            if finger_joint == joint
+        ]
         if len(owners) != 1:
             named = ", ".join(f"'{name}'" for name in owners) or "none"
             raise RobotError(
-                f"robot.hand.finger: joint '{joint}' must be of one finger; it is of {named}"
+                f"robot.hand.finger: joint '{joint}' must belong to one finger, not to {named}"
             )
 
 
 def fit_tendons(
     spec: mujoco.MjSpec, robot: RobotConfig, hand: HandConfig, step_s: float
 ) -> tuple[list[str], Array]:
-    """Remove the drives of the hand's joints other than its tendons; return the flexors and the
-    joints' torque limits.
+    """Remove the drives of the hand's joints, except its tendons.
 
-    The limits, (joints,), N m, are not known before the model is compiled: those of the `Hand`
-    replace them. Actuators that delay their controls get room to remember them, in steps of
-    `step_s`. Each tip gets a sensor of force.
+    Each tip gets a force sensor. Actuators that delay their controls get memory for the delay.
+
+    Args:
+        spec: The model, which is changed.
+        robot: The `[robot]` table.
+        hand: The `[robot.hand]` table.
+        step_s: Time step of the simulation, s.
+
+    Returns:
+        Names of the flexors, and infinite torque limits, (joints,), N m. The limits are known only
+        after the model is compiled: see `Hand.torque`.
     """
     check_hand(robot, hand)
     tendons = hand.flexors + hand.extensors
@@ -131,21 +151,32 @@ def fit_tendons(
         site = spec.site(finger.tip)
         if site is not None:
             site.parent.name = site.parent.name or f"tip of {finger.name}"
-            kind = mujoco.mjtSensor.mjSENS_CONTACT
-            body = mujoco.mjtObj.mjOBJ_BODY
             sensor = spec.add_sensor(
-                name=_force_of(finger), type=kind, reftype=body, refname=site.parent.name
+                name=_force_of(finger),
+                type=mujoco.mjtSensor.mjSENS_CONTACT,
+                reftype=mujoco.mjtObj.mjOBJ_BODY,
+                refname=site.parent.name,
             )
             sensor.intprm[:3] = NET_FORCE
     return list(hand.flexors), np.full(len(robot.joints), np.inf)
 
 
 def _force_of(finger: FingerConfig) -> str:
+    """Return the name of the force sensor at the tip of a finger."""
     return f"force on {finger.name}"
 
 
 def find_hand(model: mujoco.MjModel, robot: RobotConfig, hand: HandConfig) -> Hand:
-    """Find everything that `[robot.hand]` names in the compiled model. Raises `RobotError`."""
+    """Find everything that `[robot.hand]` names in the compiled model.
+
+    Args:
+        model: The compiled model.
+        robot: The `[robot]` table.
+        hand: The `[robot.hand]` table.
+
+    Raises:
+        RobotError: An element is missing or unsuitable.
+    """
     kind = mujoco.mjtObj
     actuators = np.stack(
         [
@@ -169,12 +200,11 @@ def find_hand(model: mujoco.MjModel, robot: RobotConfig, hand: HandConfig) -> Ha
         if first != second:
             raise RobotError(
                 f"robot.hand: tendons of joint '{joint}' pull at most {first:g} and {second:g} N;"
-                " equal is valid"
+                " both must be equal"
             )
     if not hand.rest < most.min():
         raise RobotError(
-            f"robot.hand.rest: {hand.rest:g} N; below the largest tension, {most.min():g} N, is"
-            " valid"
+            f"robot.hand.rest: {hand.rest:g} N must be below the largest tension, {most.min():g} N"
         )
     return Hand(
         names=tuple(finger.name for finger in hand.finger),
@@ -195,8 +225,15 @@ def find_hand(model: mujoco.MjModel, robot: RobotConfig, hand: HandConfig) -> Ha
 
 
 def check_tensions(model: mujoco.MjModel, actuators: Ints, least: float) -> None:
-    """Raise `RobotError` for an actuator whose control is not the tension, N, of a tendon that only
-    pulls, by more than `least`.
+    """Check that the control of each actuator is the tension of a tendon, N.
+
+    Args:
+        model: The compiled model.
+        actuators: The actuators.
+        least: Tension that every actuator must be able to exceed, N.
+
+    Raises:
+        RobotError: An actuator does anything else than pull one tendon.
     """
     low, high = np.moveaxis(model.actuator_ctrlrange[actuators], -1, 0)
     pulls = (
@@ -211,47 +248,51 @@ def check_tensions(model: mujoco.MjModel, actuators: Ints, least: float) -> None
     )
     for actuator in actuators[~pulls]:
         raise RobotError(
-            f"robot.hand: actuator '{model.actuator(int(actuator)).name}' must pull a tendon, and"
-            " nothing else, by its control, N: valid are a fixed gain of 1, no bias, a gear of -1,"
+            f"robot.hand: actuator '{model.actuator(int(actuator)).name}' must pull one tendon,"
+            " with its control as tension, N: it needs a fixed gain of 1, no bias, a gear of -1,"
             f" and a range from 0 or more to above robot.hand.least = {least:g} N"
         )
 
 
 def _arms(model: mujoco.MjModel, robot: RobotConfig, actuators: Ints) -> Array:
-    """Return the moment arms (joints,), m. Raises `RobotError` where two tendons are no pair of a
-    joint.
+    """Return the moment arms, (joints,), m.
+
+    Raises:
+        RobotError: Two tendons are not a pair of one joint, or their moment arm varies.
     """
     joints = np.array([model.joint(name).id for name in robot.joints])
-    limited = model.jnt_limited[joints, None]
-    places = (
-        np.array(robot.home),
-        *np.where(limited, model.jnt_range[joints], np.array(robot.home)[:, None]).T,
-    )
+    home = np.array(robot.home)
+    ranges = np.where(model.jnt_limited[joints, None], model.jnt_range[joints], home[:, None])
+    places = (home, *ranges.T)
     moments = np.array([actuator_moments(model, joints, place)[actuators] for place in places])
-    # (places, 2, joints), m: of flexors, and of extensors, which turn joints back.
-    own = np.diagonal(moments, axis1=2, axis2=3) * np.array([[1.0], [-1.0]])
+    # (places, 2, joints), m: arms of flexors and extensors, which turn joints back.
+    arms = np.diagonal(moments, axis1=2, axis2=3) * np.array([[1.0], [-1.0]])
     for number, joint in enumerate(robot.joints):
-        least = float(own[:, :, number].min()) + 0.0  # no -0
-        most = float(own[:, :, number].max())
+        least = float(arms[:, :, number].min()) + 0.0  # avoids -0
+        most = float(arms[:, :, number].max())
         if least < SAME_ARM or most - least > SAME_ARM * most:
             raise RobotError(
                 f"robot.hand: arms of the tendons on joint '{joint}' are {least:g} to {most:g} m;"
-                " valid is one positive arm, which does not vary, of a flexor that turns it in"
-                " positive direction and of an extensor that turns it back"
+                " the flexor must turn it in positive direction and the extensor in negative"
+                " direction, with equal arms that do not vary"
             )
         turned = np.abs(moments[:, :, number]).max(axis=(0, 1)) > SAME_ARM * least
         for other in np.flatnonzero(turned):
             if other != number:
                 raise RobotError(
-                    f"robot.hand: a tendon of joint '{joint}' turns joint '{robot.joints[other]}',"
-                    " too"
+                    f"robot.hand: a tendon of joint '{joint}' also turns joint"
+                    f" '{robot.joints[other]}'"
                 )
-    return np.array(own[0, 1])
+    return np.array(arms[0, 1])
 
 
 def actuator_moments(model: mujoco.MjModel, joints: Ints, position: Array) -> Array:
-    """Return the moments of all actuators on `joints` at a position of these, (actuators, joints),
-    m.
+    """Return the moment arms of all actuators on joints, (actuators, joints), m.
+
+    Args:
+        model: The compiled model.
+        joints: The joints.
+        position: Positions of the joints, rad.
     """
     data = mujoco.MjData(model)
     moments = np.zeros((model.nu, model.nv))

@@ -1,4 +1,4 @@
-"""Limits of an arm's joints, from config and model, and the resolution of their encoders."""
+"""Limits of an arm's joints, from config and model, and the errors of their encoders."""
 
 from __future__ import annotations
 
@@ -13,107 +13,134 @@ from rack.levels.errors import RobotError
 from rack.levels.tables import RobotConfig, SensorConfig
 
 VELOCITY_ROOM = 0.05
-"""Part of a velocity limit that planned motion leaves free, so that tracking stays clear of the
-limit gate."""
+"""Fraction of a velocity limit that planned motion leaves unused.
+
+It keeps motion with tracking errors clear of the limit gate.
+"""
 POSITION_ROOM_RAD = 0.005
-"""Distance that planned motion keeps from the ends of a joint's range, for the same reason."""
+"""Distance of planned motion from the ends of a joint's range, rad.
+
+It keeps motion with tracking errors clear of the limit gate.
+"""
 EDGE_TIMING_S = 0.1
-"""A drive's velocity is as coarse as its position over this time: it times the encoder's edges,
-which is far finer than the difference of two samples (of 1 mrad in 2.5 ms: 0.4 rad/s) and has no
-filter's lag."""
+"""Resolution of position divided by resolution of velocity, s.
+
+A drive times the encoder's edges. That is much finer than the difference of two samples (for 1 mrad
+in 2.5 ms: 0.4 rad/s) and does not lag like a filter.
+"""
 MAX_CONTACT_PART = 0.2
-"""Largest part of a torque limit that an intended contact takes, as when a part is set down: a
-third more than observed in tasks."""
+"""Largest fraction of a torque limit that an intended contact takes.
+
+Setting down an object is such a contact. The value is a third more than observed in tasks.
+"""
 MAX_RESTING_CONTACT_PART = 0.1
-"""The same for an arm that holds a part and hardly moves: dry friction may hide the push at all
-joints but one."""
+"""The same for an arm that holds an object and hardly moves.
+
+Dry friction may then hide the contact force in all joints except one.
+"""
 MIN_TURNING_JOINTS = 2
-"""Fewest turning joints at which an arm moves enough for a push to show."""
+"""Minimum number of turning joints for a contact force to be noticeable."""
 PATIENCE_PART = 0.25
-"""Largest part by which motors that keep their last torque may add to a stop from full speed; see
-`patience_of`."""
+"""Largest fraction by which motors that keep their last torque may lengthen a stop.
+
+The stop is from full speed; see `compute_patience`.
+"""
 LEAST_CYCLES = 2
-"""Torque cycles for which motors keep their last torque by default, at least: one late cycle must
-not brake the arm."""
+"""Minimum number of torque cycles for which motors keep their last torque by default.
+
+One late cycle must not engage the brakes.
+"""
 MAX_PATIENCE_S = 0.01
-"""Longest time by default, however slow or weak the arm: no torque for so long is no stall of a
-cycle or two."""
+"""Longest default time for which motors keep their last torque, s.
+
+However slow or weak the arm is, a longer absence of torques is more than a late cycle or two.
+"""
 SIGMAS = 6.0
-"""Standard deviations of noise that a monitor allows for: less than one sample in a billion exceeds
-them."""
+"""Standard deviations of noise that a monitor tolerates.
+
+Less than one sample in a billion exceeds them.
+"""
 
 
 @dataclass(frozen=True)
 class Bounds:
-    """Limits that the arm never exceeds, fault or not: as config and model give them.
+    """Limits that the arm never exceeds, fault or not, as config and model state them.
 
-    Slides have m and N where hinges have rad and N m.
+    Sliding joints have m and N where turning joints have rad and N m.
     """
 
-    position: Array  # (joints, 2), rad: low and high; -inf and inf for a joint without
-    velocity: Array  # (joints,), rad/s, both ways
-    torque: Array  # (joints,), N m, both ways
+    position: Array  # (joints, 2), rad: low and high, -inf and inf without limits
+    velocity: Array  # (joints,), rad/s, in both directions
+    torque: Array  # (joints,), N m, in both directions
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of planned motion: the bounds, less some room for tracking, and the config's
-    smoothness.
+    """Limits of planned motion.
+
+    They are the bounds with a margin for tracking errors, and the smoothness that the config
+    states.
     """
 
     position: Array  # (joints, 2), rad: low and high
-    velocity: Array  # (joints,), rad/s, both ways
-    acceleration: Array  # (joints,), rad/s2, both ways
-    jerk: Array  # (joints,), rad/s3, both ways
+    velocity: Array  # (joints,), rad/s, in both directions
+    acceleration: Array  # (joints,), rad/s2, in both directions
+    jerk: Array  # (joints,), rad/s3, in both directions
 
 
 @dataclass(frozen=True)
 class Encoders:
-    """Resolution and noise of the joints' sensors; of velocities, rad/s, they are these over
-    `EDGE_TIMING_S`.
+    """Resolution, noise and latency of the joints' sensors.
+
+    For velocities, resolution and noise are divided by `EDGE_TIMING_S`, in rad/s.
     """
 
     resolution: Array  # (joints,), rad: step of a position
     noise: Array  # (joints,), rad: standard deviation of a position
     latency_ticks: int = 0  # age of a sample when it is read
-    off_late: Array | float = 0.0  # (joints,), rad: largest error due to that
+    off_late: Array | float = 0.0  # (joints,), rad: largest error due to the age
     speed_off_late: Array | float = 0.0  # (joints,), rad/s: likewise
-    offset: Array | None = None  # (joints,), rad: added to what the drives give
+    offset: Array | None = None  # (joints,), rad: added to the drives' samples. None for 0
 
     @classmethod
     def of(cls, robot: RobotConfig, tick_s: float, default: SensorConfig | None = None) -> Encoders:
-        """Return the encoders of a `[robot]` table; if it does not say, `default`, or exact ones.
+        """Return the encoders that `[robot]` describes.
 
-        A sample is brought to the present by the arm's equation of motion, which may be wrong by as
-        much as the acceleration that is planned with.
+        The arm's equation of motion extrapolates a delayed sample to the present. The assumed error
+        of its acceleration is the acceleration limit of planned motion.
+
+        Args:
+            robot: The `[robot]` table.
+            tick_s: Duration of a tick, s.
+            default: Encoders if the table states none. None for exact ones.
         """
         joints = len(robot.joints)
         sensors = robot.sensors or default or SensorConfig()
         offset = robot.calibration.offset
         late_s = robot.latency_ticks * tick_s
-        wrong = np.array(robot.acceleration)
+        error = np.array(robot.acceleration)  # (joints,), rad/s2
         return cls(
             np.broadcast_to(sensors.resolution, joints),
             np.broadcast_to(sensors.noise, joints),
             robot.latency_ticks,
-            0.5 * wrong * late_s**2,
-            wrong * late_s,
+            0.5 * error * late_s**2,
+            error * late_s,
             None if offset is None else np.array(offset),
         )
 
     @property
     def exact(self) -> bool:
-        """Whether samples are the truth."""
+        """True if samples have no error."""
         return not (self.resolution.any() or self.noise.any())
 
     @property
     def off(self) -> Array:
-        """Largest error of a good position, (joints,), rad."""
+        """Largest error of the position in a good sample, (joints,), rad."""
         return self._off_sampled + self.off_late
 
     @property
     def speed_off(self) -> Array:
-        """Largest error of a good velocity, (joints,), rad/s."""
+        """Largest error of the velocity in a good sample, (joints,), rad/s."""
         return self._off_sampled / EDGE_TIMING_S + self.speed_off_late
 
     @property
@@ -122,26 +149,36 @@ class Encoders:
 
 
 class MotorPatience(NamedTuple):
-    """The time for which motors keep their last torque when none comes; then the brakes engage."""
+    """Time for which motors keep their last torque when no new one arrives.
+
+    Then the brakes engage.
+    """
 
     seconds: float
-    least: int  # torque cycles that it lasts in any case
+    least: int  # minimum, torque cycles
 
     def ticks(self, every: int, tick_s: float) -> int:
-        """Return it in ticks: whole torque cycles of `every` ticks of `tick_s` each."""
-        # A millionth of a cycle more: 5 ms are two cycles of 2.5 ms, whichever way those are
-        # rounded.
+        """Return the patience in ticks, as a multiple of the torque cycle.
+
+        `every` is the length of a torque cycle in ticks, and `tick_s` the duration of a tick.
+        """
+        # Adding a millionth makes 5 ms two cycles of 2.5 ms, in spite of rounding.
         return every * max(int(self.seconds / (every * tick_s) + 1e-6), self.least)
 
 
 def patience_of(robot: RobotConfig, bounds: Bounds, energy_j: float) -> MotorPatience:
-    """Return the patience of an arm whose joints, all at full speed at home, have kinetic energy
-    `energy_j`.
+    """Compute the patience of the motors.
 
-    By default it is the time in which a stop from full speed grows by at most `PATIENCE_PART`: by
-    what the joints turn at that speed, of the angle in which the brakes stop them; and by what all
-    motors put in at full torque, of the energy that the brakes take in any case. (The limits hold
-    without it: the limit gate passes every tick.)
+    By default, it is the longest time in which a stop from full speed grows by at most
+    `PATIENCE_FRACTION`, by two criteria. The first compares the angle that joints turn at full
+    speed in this time with the angle in which the brakes stop them. The second compares the energy
+    that all motors add at full torque with the energy that the brakes absorb anyway. (The limits
+    hold without this, because the limit gate checks the torque in every tick.)
+
+    Args:
+        robot: The `[robot]` table.
+        bounds: Limits of the arm.
+        energy_j: Kinetic energy of the arm at home with all joints at full speed, J.
     """
     if robot.patience_ms is not None:
         return MotorPatience(robot.patience_ms * 1e-3, 1)
@@ -153,26 +190,35 @@ def patience_of(robot: RobotConfig, bounds: Bounds, energy_j: float) -> MotorPat
 
 
 def joint_bounds(model: mujoco.MjModel, joints: Ints, robot: RobotConfig, torque: Array) -> Bounds:
-    """Return the bounds; where config and model both limit a position, the tighter limit applies.
+    """Return the bounds of the joints.
 
-    Raises `RobotError` for an empty range.
+    Where config and model both limit a position, the tighter limit applies.
+
+    Args:
+        model: The compiled model.
+        joints: The joints.
+        robot: The `[robot]` table.
+        torque: Torque limits, (joints,), N m.
+
+    Raises:
+        RobotError: A range is empty.
     """
     ranges = np.where(model.jnt_limited[joints, None], model.jnt_range[joints], [-np.inf, np.inf])
     if robot.position is not None:
-        given = np.array(robot.position)
+        stated = np.array(robot.position)
         ranges = np.stack(
-            (np.maximum(ranges[:, 0], given[:, 0]), np.minimum(ranges[:, 1], given[:, 1])), axis=1
+            (np.maximum(ranges[:, 0], stated[:, 0]), np.minimum(ranges[:, 1], stated[:, 1])), axis=1
         )
     for name, (low, high) in zip(robot.joints, ranges, strict=True):
         if not high - low > 2 * POSITION_ROOM_RAD:
             raise RobotError(
-                f"robot.position: joint '{name}' has no room from {low:g} to {high:g} rad"
+                f"robot.position: joint '{name}' cannot move from {low:g} to {high:g} rad"
             )
     return Bounds(position=ranges, velocity=np.array(robot.velocity), torque=torque)
 
 
 def planned_limits(bounds: Bounds, robot: RobotConfig) -> Limits:
-    """Return the limits of planned motion."""
+    """Return the limits of planned motion within `bounds`."""
     return Limits(
         position=bounds.position + np.array([POSITION_ROOM_RAD, -POSITION_ROOM_RAD]),
         velocity=bounds.velocity * (1.0 - VELOCITY_ROOM),

@@ -1,15 +1,14 @@
-"""The linkage of a gripper: one joint is driven, the others that the arm carries follow it by the
-model's equalities.
+"""The linkage of a gripper: one driven joint, and other joints that follow it by equalities.
 
 MuJoCo writes every equality (a gear, a loop closed by `connect` or `weld`, a coupled tendon), and
-every joint stop that is exceeded, as rows of residual and Jacobian. Gauss-Newton over them, with
-springs of joints and tendons as weak rows, finds where the linkage settles. Where equalities
-contradict each other or a stop, as soft couplings of tendons do, it settles between them, by their
-stiffness in the simulation. It is solved once for a number of openings; a pose in between is
-interpolated, which costs a cycle some microseconds. MuJoCo's own kernels add up in a fixed order:
-equal models give equal poses.
+every joint stop that is exceeded, as rows of a residual and a Jacobian. Gauss-Newton iterations
+over them, with springs of joints and tendons as weak rows, find where the linkage settles. Where
+equalities contradict each other or a stop, as soft couplings of tendons do, it settles in between,
+according to their stiffness in the simulation. The linkage is solved once for a number of openings.
+A pose in between is interpolated, which takes some microseconds of a cycle. MuJoCo's own kernels
+add up in a fixed order, so that equal models give equal poses.
 
-An equality may not tie a joint of the arm: `check_couplings` refuses that.
+An equality must not tie a joint of the arm: `check_couplings` refuses that.
 """
 
 from __future__ import annotations
@@ -28,23 +27,28 @@ from rack.levels.robot.model import JOINT_DRIVES, SCALAR_JOINTS, listed
 from rack.levels.tables import GripperConfig
 
 OPENINGS = 33
-"""Openings at which the linkage is solved, evenly from one end to the other."""
+"""Number of openings at which the linkage is solved, evenly spaced from open to closed."""
 APPROACH_STEPS = 8
-"""Steps from the model's reference pose to the nearest opening: a loop must not flip over on the
-way."""
+"""Steps from the model's reference pose to the nearest opening.
+
+A single step might flip a loop over to its other solution.
+"""
 ITERATIONS = 60
 STEP_TOLERANCE = 1e-10
 SPRING_PART = 1e-6
-"""Weight of the stiffest spring against an equality."""
+"""Weight of the stiffest spring relative to an equality."""
 DAMPING = 1e-9
 """Weight of staying in place, for joints that nothing determines."""
 FREE_PART = 0.01
-"""Share of `DAMPING` in all that holds a joint, above which the joint counts as free."""
+"""Ratio of `DAMPING` to everything that holds a joint, above which the joint counts as free."""
 RESIDUAL = 1e-3
-"""An equality that stays open by more than this, in m or rad, yields: stiffness decides."""
+"""Residual of an equality, m or rad, above which it yields.
+
+Stiffness then determines where the linkage settles.
+"""
 NOT_POSED = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS
 ROUNDING = 1e-9
-"""In the Jacobian of a tendon."""
+"""Threshold for elements of the Jacobian of a tendon."""
 LOOPS = (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD)
 STIFFNESS = 0
 IMPEDANCE = 2
@@ -53,16 +57,16 @@ IMPEDANCE = 2
 
 @dataclass(frozen=True)
 class Linkage:
-    """Positions of a gripper's joints, by its opening."""
+    """Positions of a gripper's joints as functions of its opening."""
 
     driven: int  # address of the driven joint in qpos
-    openings: Array  # (k,), rising, m or rad
+    openings: Array  # (k,), increasing, m or rad
     joints: Ints  # (n,), addresses in qpos of the joints that follow
     positions: Array  # (n, k), m or rad
-    yields: bool  # couplings contradict each other or a stop: where it settles is approximate
+    yields: bool  # True if couplings contradict each other or a stop; positions are approximate
 
     def set(self, qpos: Array, opening: float) -> None:
-        """Set the driven joint in `qpos` to `opening`, m or rad, and all that follow it."""
+        """Set the driven joint in `qpos` to `opening`, m or rad, and all joints that follow it."""
         qpos[self.driven] = opening
         for address, positions in zip(self.joints, self.positions, strict=True):
             qpos[address] = np.interp(opening, self.openings, positions)
@@ -74,24 +78,30 @@ def solve_linkage(
     hand: Mask,
     arm: Ints,
 ) -> Linkage:
-    """Return the linkage of a gripper in the bodies `hand` (nbody,), between open and closed; `arm`
-    are the arm's own joints.
+    """Solve the linkage of a gripper for openings between open and closed.
 
-    Raises `RobotError` with the equality that cannot be kept, the joint that nothing determines, or
-    the motor that nothing commands.
+    Args:
+        model: The compiled model.
+        config: The `[robot.gripper]` table.
+        hand: Bodies of the gripper, (nbody,).
+        arm: Joints of the arm.
+
+    Raises:
+        RobotError: An equality cannot be kept, nothing determines a joint, or nothing commands a
+            motor.
     """
     solver = _Solver(model, config, hand, arm)
     openings = np.linspace(
         min(config.open, config.closed), max(config.open, config.closed), OPENINGS
     )
-    rest = float(model.qpos0[solver.driven])
-    first = int(np.argmin(np.abs(openings - rest)))
+    reference = float(model.qpos0[solver.driven])
+    first = int(np.argmin(np.abs(openings - reference)))
     positions = np.zeros((len(solver.joints), OPENINGS))
-    for opening in np.linspace(rest, openings[first], APPROACH_STEPS):
+    for opening in np.linspace(reference, openings[first], APPROACH_STEPS):
         middle = solver.settle(model.qpos0, float(opening))
-    for way in (range(first, OPENINGS), range(first, -1, -1)):
+    for steps in (range(first, OPENINGS), range(first, -1, -1)):
         qpos = middle
-        for k in way:
+        for k in steps:
             qpos = solver.settle(qpos, float(openings[k]))
             solver.check(float(openings[k]))
             positions[:, k] = qpos[solver.joints]
@@ -103,7 +113,7 @@ def solve_linkage(
 
 
 class _Solver:
-    """Finds the joints of one linkage at one opening."""
+    """Finds the joint positions of one linkage at an opening."""
 
     def __init__(
         self,
@@ -122,24 +132,22 @@ class _Solver:
         carried[arm] = carried[joint] = False
         check_commanded(model, config, carried)
         self._others = np.flatnonzero(carried & ~np.isin(model.jnt_type, SCALAR_JOINTS))
-        follow = np.flatnonzero(carried & np.isin(model.jnt_type, SCALAR_JOINTS))
-        self._follow = follow
+        self._follow = follow = np.flatnonzero(carried & np.isin(model.jnt_type, SCALAR_JOINTS))
         self._loose = np.ones(len(follow), dtype=bool)
         self.yields = False
         self.driven = int(model.jnt_qposadr[joint])
         self.joints = model.jnt_qposadr[follow].astype(int)
         self._dof = model.jnt_dofadr[follow]
         self._driven_dof = int(model.jnt_dofadr[joint])
-        stiffness = model.jnt_stiffness[follow]
-        self._stiffness = stiffness
+        self._stiffness = stiffness = model.jnt_stiffness[follow]
         self._tendons = np.flatnonzero(model.tendon_stiffness > 0.0)
-        # Against an equality, the stiffest spring weighs `SPRING_PART`.
+        # Relative to an equality, the stiffest spring has the weight `SPRING_WEIGHT`.
         springs = (*stiffness, *model.tendon_stiffness)
         self._stiffest = max(float(np.max(springs, initial=0.0)), 1e-12) / SPRING_PART
         self._relaxed = model.qpos_spring[self.joints]
 
     def settle(self, start: Array, opening: float) -> Array:
-        """Return qpos with the linkage settled at `opening`, searched from `start`."""
+        """Return qpos with the linkage settled at `opening`, m or rad, searching from `start`."""
         data = self._data
         data.qpos[:] = start
         data.qpos[self.driven] = opening
@@ -148,15 +156,15 @@ class _Solver:
             matrix = self._descend(yielding=True)
         step = np.zeros(len(self.joints))
         for k in np.flatnonzero(self._loose):
-            # If a joint is free to move, only staying in place resists.
+            # If a joint is free to move, only `DAMPING` holds it.
             mujoco.mju_cholSolve(step, matrix, DAMPING * np.eye(len(step))[k])
             self._loose[k] = step[k] > FREE_PART
         return np.array(data.qpos)
 
     def _descend(self, yielding: bool) -> Array:
-        """Move the joints to where the rows' squares are least; return the factored matrix there.
+        """Minimize the sum of squared residuals; return the factored matrix at the minimum.
 
-        With `yielding` every row counts by its stiffness in the simulation.
+        With `yielding`, every row is weighted by its stiffness in the simulation.
         """
         data = self._data
         count = len(self.joints)
@@ -165,15 +173,15 @@ class _Solver:
         step = np.zeros(count)
         for _ in range(ITERATIONS if count else 0):
             residual, jacobian, stiffness = self._rows()
-            most = self._stiffest
+            stiffest = self._stiffest
             if yielding:
-                most = float(np.max(stiffness, initial=1e-12))
-                parts = np.sqrt(stiffness / most)
+                stiffest = float(np.max(stiffness, initial=1e-12))
+                parts = np.sqrt(stiffness / stiffest)
                 residual *= parts
                 jacobian *= parts[:, None]
-            springs = self._stiffness / most
+            springs = self._stiffness / stiffest
             if self._tendons.size:
-                stretched, pulls = self._stretched(most)
+                stretched, pulls = self._stretched(stiffest)
                 residual = np.concatenate((residual, stretched))
                 jacobian = np.concatenate((jacobian, pulls))
             mujoco.mju_mulMatTMat(matrix, jacobian, jacobian)
@@ -188,31 +196,37 @@ class _Solver:
         return matrix
 
     def farthest(self) -> tuple[float, int]:
-        """Return by how much the last pose leaves an equality open at most, m or rad, and its
-        id.
-        """
+        """Return the largest residual of an equality in the last pose, m or rad, and its id."""
         data = self._data
         jacobian = self._jacobian()
-        ours = np.any(jacobian[:, [*self._dof, self._driven_dof]] != 0.0, axis=1)
-        ours &= data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY
-        if not ours.any():
+        rows = np.any(jacobian[:, [*self._dof, self._driven_dof]] != 0.0, axis=1)
+        rows &= data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY
+        if not rows.any():
             return 0.0, -1
-        worst = int(np.argmax(np.where(ours, np.abs(data.efc_pos), 0.0)))
+        worst = int(np.argmax(np.where(rows, np.abs(data.efc_pos), 0.0)))
         return abs(float(data.efc_pos[worst])), int(data.efc_id[worst])
 
     def check(self, opening: float) -> None:
-        """Note where the last pose leaves an equality open. Raises `RobotError` for a loop."""
-        away, equality = self.farthest()
-        self.yields |= away > RESIDUAL
-        if away > self._config.residual and self._model.eq_type[equality] in map(int, LOOPS):
+        """Record whether the last pose leaves an equality open.
+
+        Raises:
+            RobotError: A loop stays open.
+        """
+        residual, equality = self.farthest()
+        self.yields |= residual > RESIDUAL
+        if residual > self._config.residual and self._model.eq_type[equality] in map(int, LOOPS):
             raise RobotError(
-                f"robot.gripper: equality {equality_name(self._model, equality)} is {away:.4f} m"
-                f" or rad off with the gripper at {opening:g}; robot.gripper.residual permits"
-                f" {self._config.residual:g}"
+                f"robot.gripper: equality {equality_name(self._model, equality)} is off by"
+                f" {residual:.4f} m or rad with the gripper at {opening:g}; robot.gripper.residual"
+                f" permits {self._config.residual:g}"
             )
 
     def check_all_follow(self) -> None:
-        """Raise `RobotError` for a joint that neither an equality nor a spring determines."""
+        """Check that an equality or a spring determines every joint.
+
+        Raises:
+            RobotError: Nothing determines a joint.
+        """
         for joint in (*self._others, *self._follow[self._loose]):
             name = (
                 self._model.joint(int(joint)).name
@@ -225,8 +239,11 @@ class _Solver:
             )
 
     def _rows(self) -> tuple[Array, Array, Array]:
-        """Return residuals (rows,), their Jacobian (rows, joints), and the force per residual
-        (rows,) in the simulation: of equalities, and of joint stops that are exceeded.
+        """Return the rows of equalities and exceeded joint stops.
+
+        Returns:
+            Residuals, (rows,), their Jacobian, (rows, joints), and their stiffness in the
+            simulation, (rows,).
         """
         data = self._data
         jacobian = self._jacobian()[:, self._dof]
@@ -237,8 +254,12 @@ class _Solver:
         return np.array(data.efc_pos[rows]), np.ascontiguousarray(jacobian[rows]), stiffness
 
     def _stretched(self, most: float) -> tuple[Array, Array]:
-        """Return the rows of tendons that are springs, (tendons,) and (tendons, joints), their
-        stiffness a part of `most`.
+        """Return the rows of tendons that are springs.
+
+        Their stiffness is divided by `most`.
+
+        Returns:
+            Residuals, (tendons,), and their Jacobian, (tendons, joints).
         """
         model = self._model
         jacobian = tendon_jacobian(model, self._data)[self._tendons]
@@ -248,14 +269,21 @@ class _Solver:
         return parts * (length - slack), parts[:, None] * jacobian[:, self._dof]
 
     def _jacobian(self) -> Array:
-        """Return the Jacobian (rows, nv) of all constraints at the present pose."""
+        """Return the Jacobian of all constraints at the present pose, (rows, nv)."""
         mujoco.mj_fwdPosition(self._model, self._data)
         return np.asarray(self._data.efc_J).reshape(-1, self._model.nv)
 
 
 def check_commanded(model: mujoco.MjModel, config: GripperConfig, carried: Mask) -> None:
-    """Raise `RobotError` for an actuator, not the gripper's own, of a joint of those `carried`
-    (njnt,) by the hand.
+    """Check that the gripper has no actuator that nothing commands.
+
+    Args:
+        model: The compiled model.
+        config: The `[robot.gripper]` table.
+        carried: Joints of the gripper that follow, (njnt,).
+
+    Raises:
+        RobotError: A joint of the gripper has such an actuator.
     """
     for k in range(model.nu):
         name = model.actuator(k).name
@@ -263,13 +291,13 @@ def check_commanded(model: mujoco.MjModel, config: GripperConfig, carried: Mask)
         drive = mujoco.mjtTrn(int(model.actuator_trntype[k])) in JOINT_DRIVES
         if drive and carried[joint] and name != config.actuator:
             raise RobotError(
-                f"robot.gripper: joint '{model.joint(joint).name}' has an actuator of its own,"
-                f" '{name}', that nothing commands; name the joint in [[robot.gripper.follow]]"
+                f"robot.gripper: joint '{model.joint(joint).name}' has an actuator, '{name}', that"
+                " nothing commands; name the joint in [[robot.gripper.follow]]"
             )
 
 
 def equality_name(model: mujoco.MjModel, equality: int) -> str:
-    """Return an equality's name or, when it has none, its kind and what it couples."""
+    """Return the name of an equality, or its kind and what it couples if it has no name."""
     if name := model.equality(equality).name:
         return f"'{name}'"
     kind = mujoco.mjtEq(int(model.eq_type[equality]))
@@ -290,7 +318,7 @@ def check_couplings(model: mujoco.MjModel, joints: Sequence[str], of_bodies: boo
 
     Args:
         model: The compiled model.
-        joints: The arm's joints.
+        joints: Names of the arm's joints.
         of_bodies: Whether to check equalities between bodies as well.
 
     Raises:
@@ -308,14 +336,17 @@ def check_couplings(model: mujoco.MjModel, joints: Sequence[str], of_bodies: boo
 
 
 def tied_joints(model: mujoco.MjModel, equality: int) -> set[int]:
-    """Return the joints that an equality ties. Bodies are tied by joints that move only one."""
+    """Return the joints that an equality ties.
+
+    Two bodies are tied by the joints that move only one of them.
+    """
     ends = np.array([model.eq_obj1id[equality], model.eq_obj2id[equality]])
     ends = ends[ends >= 0]
     kind = model.eq_type[equality]
     if kind == mujoco.mjtEq.mjEQ_JOINT:
         return set(ends.tolist())
     if kind == mujoco.mjtEq.mjEQ_TENDON:
-        # The joints that change the tendons' lengths.
+        # Joints are tied if they change the length of a tendon.
         data = mujoco.MjData(model)
         mujoco.mj_fwdPosition(model, data)
         moving = (np.abs(tendon_jacobian(model, data)[ends]) > ROUNDING).any(axis=0)

@@ -1,5 +1,6 @@
-"""Look up the names of a config in a compiled model. Every mistake is one `RobotError` that lists
-the valid names.
+"""Lookup of the names of a config in a compiled model.
+
+Every mistake is one `RobotError` that lists the valid names.
 """
 
 from __future__ import annotations
@@ -22,18 +23,29 @@ from rack.levels.robot.model import (
 from rack.levels.tables import RobotConfig, SceneConfig
 
 COUNTS = {"site": "nsite", "body": "nbody", "geom": "ngeom", "joint": "njnt", "actuator": "nu"}
-"""Attributes of a model with the numbers of its elements, by kind."""
+"""Attributes of a model with the numbers of its elements, by kind of element."""
 
 
 def find(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str, place: str) -> int:
-    """Return the id of a named element; `place` is the config's key. Raises `RobotError`."""
-    found = mujoco.mj_name2id(model, kind, name)
-    if found >= 0:
-        return int(found)
+    """Return the id of a named element.
+
+    Args:
+        model: The compiled model.
+        kind: Kind of the element.
+        name: Name of the element.
+        place: Key of the config that has the name, for the error.
+
+    Raises:
+        RobotError: The model has no such element.
+    """
+    number = mujoco.mj_name2id(model, kind, name)
+    if number >= 0:
+        return int(number)
     noun = kind.name.removeprefix("mjOBJ_").lower()
     count = getattr(model, COUNTS[noun])
     have = listed([mujoco.mj_id2name(model, kind, k) or "" for k in range(count)])
-    if place == "robot.tool":  # a body serves as well
+    # The tool may also be a body.
+    if place == "robot.tool":
         have += "; bodies: " + listed([model.body(k).name for k in range(model.nbody)])
     raise RobotError(f"{place}: no {noun} '{name}' in the model; it has: {have}")
 
@@ -41,19 +53,31 @@ def find(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str, place: str) -> i
 def find_all(
     model: mujoco.MjModel, kind: mujoco.mjtObj, names: tuple[str, ...], place: str
 ) -> Ints:
-    """Return the ids of named elements. Raises `RobotError`."""
+    """Return the ids of named elements.
+
+    Args:
+        model: The compiled model.
+        kind: Kind of the elements.
+        names: Names of the elements.
+        place: Key of the config that has the names, for the error.
+
+    Raises:
+        RobotError: The model lacks an element.
+    """
     return np.array([find(model, kind, name, place) for name in names], dtype=int)
 
 
 def unknown_names(robot: RobotConfig, scene: SceneConfig) -> Iterator[str]:
-    """Yield a line for every name in the config that the model lacks. Raises `RobotError` for a
-    broken model.
+    """Yield a line for every name in the config that the model lacks.
+
+    Raises:
+        RobotError: The model is invalid.
     """
     model = compile_spec(load_spec(robot.model), robot.model)
     kind = mujoco.mjtObj
     is_body = mujoco.mj_name2id(model, kind.mjOBJ_BODY, robot.tool) >= 0
     gripper = robot.gripper
-    wanted = [
+    expected = [
         (kind.mjOBJ_JOINT, robot.joints, "robot.joints"),
         (kind.mjOBJ_SITE, () if is_body else (robot.tool,), "robot.tool"),
         (kind.mjOBJ_BODY, tuple(chain(*robot.exclude)), "robot.exclude"),
@@ -61,29 +85,34 @@ def unknown_names(robot: RobotConfig, scene: SceneConfig) -> Iterator[str]:
     ]
     if robot.hand is not None:
         tips = tuple(finger.tip for finger in robot.hand.finger)
-        wanted += [
+        expected += [
             (kind.mjOBJ_SITE, tips, "robot.hand.finger.tip"),
             (kind.mjOBJ_ACTUATOR, robot.hand.flexors, "robot.hand.flexors"),
             (kind.mjOBJ_ACTUATOR, robot.hand.extensors, "robot.hand.extensors"),
         ]
-    wanted += [
+    expected += [
         (kind.mjOBJ_BODY, scene.objects, "scene.objects"),
         (kind.mjOBJ_BODY, scene.obstacles, "scene.obstacles"),
         (kind.mjOBJ_GEOM, scene.supports, "scene.supports"),
     ]
-    for what, names, place in wanted:
+    for element_kind, names, place in expected:
         for name in names:
             try:
-                find(model, what, name, place)
+                find(model, element_kind, name, place)
             except RobotError as error:
                 yield str(error)
 
 
 def tool_site(model: mujoco.MjModel, name: str, moved: Mask | None) -> int:
-    """Return the id of the tool's site, on one of the bodies `moved` (nbody,) by the arm; None: on
-    any.
+    """Return the id of the tool's site.
 
-    Raises `RobotError`.
+    Args:
+        model: The compiled model.
+        name: Name of the site.
+        moved: Bodies on which the site may be, (nbody,). None if it may be on any body.
+
+    Raises:
+        RobotError: The site is missing or on another body.
     """
     tool = find(model, mujoco.mjtObj.mjOBJ_SITE, name, "robot.tool")
     if moved is not None and not moved[model.site_bodyid[tool]]:
@@ -92,30 +121,38 @@ def tool_site(model: mujoco.MjModel, name: str, moved: Mask | None) -> int:
 
 
 def free_joints(model: mujoco.MjModel, bodies: Ints) -> Ints:
-    """Return the ids of the objects' free joints. Raises `RobotError` for a body without one."""
+    """Return the ids of the objects' free joints.
+
+    Raises:
+        RobotError: A body has no free joint.
+    """
     joints = model.body_jntadr[bodies]
     for body, joint in zip(bodies, joints, strict=True):
         if joint < 0 or model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_FREE:
             raise RobotError(
-                f"scene.objects: body '{model.body(body).name}' has no free joint; give it"
-                " <freejoint/>"
+                f"scene.objects: body '{model.body(body).name}' has no free joint; add"
+                " <freejoint/> to it"
             )
     return np.asarray(joints, dtype=int)
 
 
 def mocap_ids(model: mujoco.MjModel, bodies: Ints) -> Ints:
-    """Return the mocap ids of the obstacles. Raises `RobotError` for a body without one."""
+    """Return the mocap ids of the obstacles.
+
+    Raises:
+        RobotError: An obstacle is not a mocap body.
+    """
     for body in bodies:
         if model.body_mocapid[body] < 0:
             name = model.body(body).name
             raise RobotError(
-                f"scene.obstacles: body '{name}' cannot move by itself; give it mocap='true'"
+                f"scene.obstacles: body '{name}' is not a mocap body; add mocap='true' to it"
             )
     return np.asarray(model.body_mocapid[bodies], dtype=int)
 
 
 def below(model: mujoco.MjModel, roots: Ints) -> Mask:
-    """Mark (nbody,) the bodies `roots` and their descendants."""
+    """Return a mask of the bodies `roots` and all their descendants, (nbody,)."""
     marked = np.zeros(model.nbody, dtype=bool)
     marked[roots] = True
     for body in range(1, model.nbody):
@@ -124,39 +161,49 @@ def below(model: mujoco.MjModel, roots: Ints) -> Mask:
 
 
 def geoms_of(model: mujoco.MjModel, bodies: Mask) -> Ints:
-    """Return the ids of the geoms on the bodies marked (nbody,)."""
+    """Return the ids of the geoms on the bodies of a mask, (nbody,)."""
     return np.flatnonzero(bodies[model.geom_bodyid])
 
 
 def geom_name(model: mujoco.MjModel, geom: int) -> str:
-    """Return a geom's name or, when it has none, its body's."""
+    """Return the name of a geom, or of its body if it has none."""
     return model.geom(geom).name or f"body {model.body(model.geom_bodyid[geom]).name}"
 
 
 def derived(robot: RobotConfig) -> RobotConfig:
-    """Return the table with its joints, tool and home. Raises `RobotError`."""
+    """Return the table with joints, tool and home added from the model.
+
+    Raises:
+        RobotError: The model does not determine them.
+    """
     model = compile_spec(load_spec(robot.model), robot.model)
     joints = robot.joints or _driven(model, robot)
     if not joints:
-        raise RobotError("robot.joints: none named, and none in the model has an actuator")
+        raise RobotError("robot.joints: name the joints, because none in the model has an actuator")
     check_number(joints)
-    kind = mujoco.mjtObj.mjOBJ_JOINT
-    ids = [find(model, kind, name, "robot.joints") for name in joints]
+    ids = find_all(model, mujoco.mjtObj.mjOBJ_JOINT, joints, "robot.joints")
     start = model.key_qpos[0] if model.nkey else model.qpos0
     home = start[model.jnt_qposadr[ids]].tolist()
     last = int(model.jnt_bodyid[ids[-1]])
     carried = below(model, np.array([last]))
     sites = [model.site(k).name for k in np.flatnonzero(carried[model.site_bodyid])]
     named = [name for name in sites if name] or [model.body(last).name]
-    found = {"joints": joints, "tool": robot.tool or named[-1], "home": robot.home or tuple(home)}
-    return robot.model_copy(update=found)
+    return robot.model_copy(
+        update={
+            "joints": joints,
+            "tool": robot.tool or named[-1],
+            "home": robot.home or tuple(home),
+        }
+    )
 
 
 def _driven(model: mujoco.MjModel, robot: RobotConfig) -> tuple[str, ...]:
-    """Return the joints with an actuator, base to tool, but the gripper's."""
+    """Return the names of the joints with an actuator, from base to tool, without the gripper's."""
     of_joint = np.isin(model.actuator_trntype, JOINT_DRIVES)
     driven = np.unique(model.actuator_trnid[of_joint, 0])
     names = [str(model.joint(k).name) for k in driven]
     gripper = robot.gripper
-    own = () if gripper is None else (gripper.joint, *(given.joint for given in gripper.follow))
-    return tuple(name for name in names if name not in own)
+    gripper_joints = (
+        () if gripper is None else (gripper.joint, *(follower.joint for follower in gripper.follow))
+    )
+    return tuple(name for name in names if name not in gripper_joints)

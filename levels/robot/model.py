@@ -1,4 +1,4 @@
-"""Fit a model to the servo level: torque motors, integrator, time step, tool, keyframe."""
+"""Preparation of a model for the servo level: motors, integrator, time step, tool, keyframe."""
 
 from __future__ import annotations
 
@@ -22,22 +22,24 @@ from rack.levels.tables import (
 )
 
 LONGEST_STEP_S = 0.1
-"""A longer time step in an MJCF file is a mistake, such as ms for s."""
+"""Maximum time step of an MJCF file. A longer one is a mistake, such as ms for s."""
 JOINT_DRIVES = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 SET_POINT_ROWS = 3
-"""Numbers a joint that MuJoCo's state keeps of simulated drives that follow set points: position,
-velocity, and the torque of the integral."""
+"""Numbers per joint that MuJoCo's state contains for simulated drives that follow set points.
+
+They are position, velocity, and the torque of the integral.
+"""
 SCALAR_JOINTS = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
-# MuJoCo would print its warnings, and write them to a file in the working directory. Whoever needs
-# one looks for its cause: steps of the simulation, for example, count them.
+# MuJoCo would print its warnings, and write them to a file in the working directory. Code that
+# needs to know of a warning reads its counters instead, as the steps of the simulation do.
 mujoco.set_mju_user_warning(lambda _: None)
 
 
 def load_spec(path: Path) -> mujoco.MjSpec:
-    """Return the parsed, not yet compiled, MJCF file.
+    """Parse an MJCF file, without compiling it.
 
-    Raises `RobotError` for a file that `ModelReader` or MuJoCo refuses, or that has an invalid time
-    step.
+    Raises:
+        RobotError: `ModelReader` or MuJoCo refuses the file, or its time step is invalid.
     """
     texts = ModelReader(path).texts
     try:
@@ -47,15 +49,19 @@ def load_spec(path: Path) -> mujoco.MjSpec:
     step = float(spec.option.timestep)
     if not 0 < step <= LONGEST_STEP_S:
         raise RobotError(
-            f"model '{path}': timestep {step:g} s is not valid; above 0, at most"
+            f"model '{path}': timestep {step:g} s is invalid; it must be above 0 and at most"
             f" {LONGEST_STEP_S:g} s"
         )
     return spec
 
 
 def compile_spec(spec: mujoco.MjSpec, path: Path) -> mujoco.MjModel:
-    """Compile. Inertias of bodies that never move are given up if they are what MuJoCo refuses.
-    Raises `RobotError` with MuJoCo's reason in one line.
+    """Compile a model.
+
+    If MuJoCo refuses inertias of bodies that never move, these inertias are dropped.
+
+    Raises:
+        RobotError: The model cannot be compiled. The text is MuJoCo's reason in one line.
     """
     try:
         return spec.compile()
@@ -66,34 +72,42 @@ def compile_spec(spec: mujoco.MjSpec, path: Path) -> mujoco.MjModel:
 
 
 def drop_fixed_inertias(body: mujoco.MjsBody) -> bool:
-    """Give all below `body` that no joint moves the inertia of its geoms; return whether any stated
-    another.
+    """Remove stated inertias of all descendants of `body` that no joint moves.
+
+    Returns:
+        True if any was removed.
     """
-    found = False
-    # Lists of children repeat the error of a compilation that failed.
+    is_dropped = False
+    # The lists of children of a body raise the error of the failed compilation again.
     child = body.first_body()
     while child is not None:
         if child.first_joint() is None:
-            found |= drop_fixed_inertias(child) or bool(child.explicitinertial)
+            is_dropped |= drop_fixed_inertias(child) or bool(child.explicitinertial)
             child.explicitinertial = False
             child.fullinertia = np.full(6, np.nan)
             child.inertia = np.zeros(3)
         child = body.next_body(child)
-    return found
+    return is_dropped
 
 
 def check_number(joints: Sequence[str]) -> None:
-    """Raise `RobotError` for more joints than an arm may have."""
+    """Check that an arm does not have too many joints.
+
+    Raises:
+        RobotError: There are more than `MAX_JOINTS`.
+    """
     if len(joints) > MOST_JOINTS:
         raise RobotError(
-            f"an arm has at most {MOST_JOINTS} joints, and not {len(joints)}: {listed([*joints])};"
-            " name fewer, in robot.joints, or by --tip or --joints of 'rack robot new'"
+            f"an arm has at most {MOST_JOINTS} joints, not {len(joints)}: {listed([*joints])};"
+            " name fewer in robot.joints, or by --tip or --joints of 'rack robot new'"
         )
 
 
 def check_joints(robot: RobotConfig, spec: mujoco.MjSpec) -> None:
-    """Raise `RobotError` for a list of the wrong length, and for a joint that is missing, not
-    scalar or named twice.
+    """Check the joints of the arm, and the lengths of lists.
+
+    Raises:
+        RobotError: A list has the wrong length, or a joint is missing, not scalar or named twice.
     """
     for key, _, why in robot.misfits():
         raise RobotError(f"robot.{key}: {why}")
@@ -104,22 +118,28 @@ def check_joints(robot: RobotConfig, spec: mujoco.MjSpec) -> None:
             raise RobotError(f"robot.joints: no joint '{name}' in the model; it has: {have}")
         if joint.type not in SCALAR_JOINTS:
             kind = joint.type.name.removeprefix("mjJNT_").lower()
-            raise RobotError(f"robot.joints: '{name}' is a {kind} joint; valid: hinge, slide")
+            raise RobotError(f"robot.joints: '{name}' is a {kind} joint, must be hinge or slide")
         if robot.joints.count(name) > 1:
             raise RobotError(
-                f"robot.joints: '{name}' is named {robot.joints.count(name)} times; once is valid"
+                f"robot.joints: '{name}' is named {robot.joints.count(name)} times instead of once"
             )
 
 
 def prepare(spec: mujoco.MjSpec, robot: RobotConfig, clock_ns: int) -> None:
-    """Set what the servo level needs in any model: integrator, time step, drive inertia, tool,
-    gripper, keyframe.
+    """Set everything that the servo level needs in any model.
+
+    These are integrator, time step, drive inertia, tool, gripper and keyframe.
+
+    Args:
+        spec: The model, which is changed.
+        robot: The `[robot]` table.
+        clock_ns: Duration of a tick, ns.
     """
     option = spec.option
     option.timestep = clock_ns * 1e-9 / robot.substeps
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
-    # A reset to t = 0 would hide a broken state.
+    # An automatic reset to t = 0 would hide an invalid state.
     option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
     option.enableflags &= ~SLEEP
     for name in robot.joints:
@@ -136,17 +156,23 @@ def prepare(spec: mujoco.MjSpec, robot: RobotConfig, clock_ns: int) -> None:
         fit_gripper(spec, robot.gripper)
     if robot.interface != "torque":
         spec.nuserdata += SET_POINT_ROWS * len(robot.joints)
+    # The controls in keyframes belong to actuators that were replaced.
     for key in list(spec.keys):
-        spec.delete(key)  # its controls belong to actuators that were replaced
+        spec.delete(key)
     spec.add_key(name="start")
 
 
 def fit_motors(spec: mujoco.MjSpec, robot: RobotConfig) -> tuple[list[str], Array]:
-    """Replace the drives of the arm's joints in `spec`; return the motors' names and torque limits
-    (joints,), N m.
+    """Replace the drives of the arm's joints in `spec` by torque motors.
 
-    A limit comes from `robot.torque`, else it is the tightest of the joint's actuatorfrcrange and
-    the ranges of its actuators. Raises `RobotError` when neither has one.
+    A torque limit comes from `robot.torque`. Otherwise it is the tightest of the joint's
+    actuatorfrcrange and the ranges of its actuators.
+
+    Returns:
+        Names of the motors, and torque limits, (joints,), N m.
+
+    Raises:
+        RobotError: Neither config nor model has a limit, or joints share an actuator.
     """
     drives = [a for a in spec.actuators if drives_arm(spec, a, robot)]
     tendons = [a for a in drives if a.trntype not in JOINT_DRIVES]
@@ -154,46 +180,47 @@ def fit_motors(spec: mujoco.MjSpec, robot: RobotConfig) -> tuple[list[str], Arra
     shared &= {joint for a in tendons for joint in driven_by(spec, a)}
     if len(shared) > len(tendons):
         raise RobotError(
-            f"joints {listed(sorted(shared))} share one actuator, but those of an arm are driven"
-            " independently; give each its own"
+            f"joints {listed(sorted(shared))} share one actuator, but joints of an arm are driven"
+            " independently; give each a separate actuator"
         )
     limits = robot.torque or tuple(stated_torque(spec, name, drives) for name in robot.joints)
     if 0.0 in limits:
         raise RobotError(
-            f"joint '{robot.joints[limits.index(0.0)]}': the model gives no torque limit; give"
-            " robot.torque, N m, one value a joint"
+            f"joint '{robot.joints[limits.index(0.0)]}': the model has no torque limit; set"
+            " robot.torque, N m, one value per joint"
         )
     remove(spec, drives)
     names = [f"torque of {joint}" for joint in robot.joints]
     for name, joint, limit in zip(names, robot.joints, limits, strict=True):
         drive = spec.joint(joint)
         drive.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
-        # With actgravcomp the motor would carry a torque that nobody commanded; a passive force is
-        # in the model's bias.
+        # With actgravcomp the motor would carry a torque that was not commanded, whereas a passive
+        # force is part of the model's bias.
         drive.actgravcomp = False
         add_motor(spec, name, mujoco.mjtTrn.mjTRN_JOINT, joint, limit)
     return names, np.array(limits)
 
 
 def fit_gripper(spec: mujoco.MjSpec, gripper: GripperConfig) -> None:
-    """Make the gripper's actuator a force motor on the joint or tendon that it drives, limited to
-    `gripper.force`.
+    """Replace the gripper's actuator by a force motor on the same joint or tendon.
 
-    Raises `RobotError` when the model has no such actuator, or it drives neither a joint nor a
-    tendon.
+    It is limited to `gripper.force`.
+
+    Raises:
+        RobotError: The model has no such actuator, or it drives neither a joint nor a tendon.
     """
     old = spec.actuator(gripper.actuator)
     if old is None:
         have = listed([a.name for a in spec.actuators])
         raise RobotError(
-            f"robot.gripper.actuator: '{gripper.actuator}' is not in the model; actuators: {have}"
+            f"robot.gripper.actuator: '{gripper.actuator}' is not in the model; it has: {have}"
         )
     kind = old.trntype
     target = old.target
     if kind not in (*JOINT_DRIVES, mujoco.mjtTrn.mjTRN_TENDON):
         raise RobotError(
-            f"robot.gripper.actuator: '{gripper.actuator}' is a {kind.name}; valid: on a joint or"
-            " tendon"
+            f"robot.gripper.actuator: '{gripper.actuator}' is a {kind.name}; it must be on a joint"
+            " or tendon"
         )
     remove(spec, [old])
     add_motor(spec, gripper.actuator, kind, target, gripper.force)
@@ -202,8 +229,15 @@ def fit_gripper(spec: mujoco.MjSpec, gripper: GripperConfig) -> None:
 
 
 def couple(spec: mujoco.MjSpec, gripper: GripperConfig, follower: FollowConfig) -> None:
-    """Make a joint follow the gripper's driven one, in place of its own actuators. Raises
-    `RobotError`.
+    """Make a joint follow the gripper's driven joint, and remove its actuators.
+
+    Args:
+        spec: The model, which is changed.
+        gripper: The `[robot.gripper]` table.
+        follower: The joint.
+
+    Raises:
+        RobotError: A joint is missing, or it is the driven joint.
     """
     for name in (follower.joint, gripper.joint):
         if spec.joint(name) is None:
@@ -211,29 +245,32 @@ def couple(spec: mujoco.MjSpec, gripper: GripperConfig, follower: FollowConfig) 
             raise RobotError(f"robot.gripper: no joint '{name}' in the model; it has: {have}")
     if follower.joint == gripper.joint:
         raise RobotError(f"robot.gripper.follow: '{follower.joint}' is the driven joint itself")
-    own = [a for a in spec.actuators if a.trntype in JOINT_DRIVES and a.target == follower.joint]
-    if any(a.name == gripper.actuator for a in own):
+    drives = [a for a in spec.actuators if a.trntype in JOINT_DRIVES and a.target == follower.joint]
+    if any(a.name == gripper.actuator for a in drives):
         raise RobotError(
-            f"robot.gripper.follow: '{follower.joint}' is driven by the gripper's own actuator"
+            f"robot.gripper.follow: '{follower.joint}' is driven by the gripper's actuator"
         )
-    remove(spec, own)
+    remove(spec, drives)
     equality = spec.add_equality(name=f"{follower.joint} follows {gripper.joint}")
     equality.type = mujoco.mjtEq.mjEQ_JOINT
     equality.name1 = follower.joint
     equality.name2 = gripper.joint
     equality.data[:2] = [0.0, follower.ratio]
-    # As stiff as a gear: with the defaults a finger lags by millimetres.
+    # As stiff as a gear. With the default values a finger lags by millimetres.
     equality.solref = [0.002, 1.0]
     equality.solimp[:3] = [0.99, 0.999, 0.001]
 
 
 def drives_arm(spec: mujoco.MjSpec, actuator: mujoco.MjsActuator, robot: RobotConfig) -> bool:
-    """Say whether an actuator drives a joint of the arm, by itself or through a fixed tendon."""
+    """Return True if an actuator drives a joint of the arm.
+
+    It may do so directly or through a fixed tendon.
+    """
     return not {*robot.joints}.isdisjoint(driven_by(spec, actuator))
 
 
 def driven_by(spec: mujoco.MjSpec, actuator: mujoco.MjsActuator) -> list[str]:
-    """Return the joints that an actuator drives, by itself or through a fixed tendon."""
+    """Return the joints that an actuator drives, directly or through a fixed tendon."""
     if actuator.trntype in JOINT_DRIVES:
         return [actuator.target]
     is_tendon = actuator.trntype == mujoco.mjtTrn.mjTRN_TENDON
@@ -243,24 +280,30 @@ def driven_by(spec: mujoco.MjSpec, actuator: mujoco.MjsActuator) -> list[str]:
 
 
 def stated_torque(spec: mujoco.MjSpec, joint: str, drives: Iterable[mujoco.MjsActuator]) -> float:
-    """Return the tightest torque limit that a model states for a joint, N m. 0 where it states none
-    that a `[robot]` table may have, such as infinity.
+    """Return the tightest torque limit that a model states for a joint, N m.
+
+    0 if it states none, or only limits that a `[robot]` table must not have, such as infinity.
+
+    Args:
+        spec: The model.
+        joint: Name of the joint.
+        drives: Actuators of the arm.
     """
-    own = spec.joint(joint)
-    found = [reach(own.actfrclimited, own.actfrcrange)]
-    found += [drive_limit(a) for a in drives if a.trntype in JOINT_DRIVES and a.target == joint]
-    return min((x for x in found if 0 < x < MOST), default=0.0)
+    element = spec.joint(joint)
+    limits = [reach(element.actfrclimited, element.actfrcrange)]
+    limits += [drive_limit(a) for a in drives if a.trntype in JOINT_DRIVES and a.target == joint]
+    return min((x for x in limits if 0 < x < MOST), default=0.0)
 
 
 def drive_limit(actuator: mujoco.MjsActuator) -> float:
-    """Return the torque limit that an actuator on a joint implies, N m; 0: none."""
+    """Return the torque limit that an actuator on a joint implies, N m. 0 if it has none."""
     gear = abs(float(actuator.gear[0]))
     limits = [reach(actuator.forcelimited, actuator.forcerange) * gear]
-    direct = (
+    if (
         actuator.dyntype == mujoco.mjtDyn.mjDYN_NONE
         and actuator.biastype == mujoco.mjtBias.mjBIAS_NONE
-    )
-    if direct and actuator.gaintype == mujoco.mjtGain.mjGAIN_FIXED:
+        and actuator.gaintype == mujoco.mjtGain.mjGAIN_FIXED
+    ):
         limits.append(
             reach(actuator.ctrllimited, actuator.ctrlrange) * abs(float(actuator.gainprm[0])) * gear
         )
@@ -268,7 +311,7 @@ def drive_limit(actuator: mujoco.MjsActuator) -> float:
 
 
 def reach(limited: mujoco.mjtLimited, span: Array) -> float:
-    """Return the largest symmetric range within `span`; 0: there is none."""
+    """Return the largest symmetric range within `span`. 0 if there is none."""
     if limited == mujoco.mjtLimited.mjLIMITED_FALSE or not span[0] < span[1]:
         return 0.0
     return max(0.0, min(-float(span[0]), float(span[1])))
@@ -277,7 +320,15 @@ def reach(limited: mujoco.mjtLimited, span: Array) -> float:
 def add_motor(
     spec: mujoco.MjSpec, name: str, kind: mujoco.mjtTrn, target: str, limit: float
 ) -> None:
-    """Add a motor of gear 1 whose control is its force, N or N m, within `limit` both ways."""
+    """Add a motor of gear 1 whose control is its force or torque.
+
+    Args:
+        spec: The model, which is changed.
+        name: Name of the motor.
+        kind: Kind of the target.
+        target: Joint or tendon that it drives.
+        limit: Largest force or torque in both directions, N or N m.
+    """
     motor = spec.add_actuator(name=name, trntype=kind, target=target)
     motor.set_to_motor()
     motor.ctrllimited = motor.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
@@ -285,22 +336,22 @@ def add_motor(
 
 
 def remove(spec: mujoco.MjSpec, actuators: list[mujoco.MjsActuator]) -> None:
-    """Remove actuators, and the sensors on them."""
-    gone = {a.name for a in actuators}
+    """Remove actuators and the sensors on them."""
+    names = {a.name for a in actuators}
     for sensor in list(spec.sensors):
-        if sensor.objtype == mujoco.mjtObj.mjOBJ_ACTUATOR and sensor.objname in gone:
+        if sensor.objtype == mujoco.mjtObj.mjOBJ_ACTUATOR and sensor.objname in names:
             spec.delete(sensor)
     for actuator in actuators:
         spec.delete(actuator)
 
 
 def one_line(problem: Exception) -> str:
-    """Return MuJoCo's message without its line breaks."""
+    """Return MuJoCo's message without line breaks."""
     return " ".join(str(problem).split()).removeprefix("Error: ")
 
 
 def listed(names: list[str], most: int = 24) -> str:
-    """Return names for an error message: at most `most` of them."""
+    """Format names for an error message, at most `most` of them."""
     named = [n for n in names if n]
     more = f" and {len(named) - most} more" if len(named) > most else ""
     return (", ".join(named[:most]) or "none") + more

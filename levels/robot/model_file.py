@@ -1,7 +1,7 @@
-"""Read the XML of a model before MuJoCo does.
+"""Reading of a model's XML files before MuJoCo reads them.
 
-The files are not trusted: every mistake is one `RobotError`, in bounded time and memory. MuJoCo
-gets the text that is checked here, and opens no XML file itself.
+The files are not trusted. Every mistake is one `RobotError`, found in bounded time and memory.
+MuJoCo receives the text that was checked here, and opens no XML file itself.
 """
 
 from __future__ import annotations
@@ -19,23 +19,27 @@ from rack.backplane.regular_file import check_regular_file, read_regular_file
 from rack.levels.errors import RobotError
 
 MODEL_BYTES = 16_000_000
-"""Size of all XML files of a model, at most."""
+"""Maximum size of all XML files of a model."""
 ASSET_BYTES = 200_000_000
-"""Size of one mesh, texture or height field, at most."""
+"""Maximum size of one mesh, texture or height field."""
 PIXELS = 70_000_000
-"""Pixels of one image, at most: a small file may hold more than memory does."""
+"""Maximum number of pixels of an image. A small file may exceed memory when decoded."""
 MOST_DEPTH = 300
-"""Elements within each other, at most."""
+"""Maximum nesting depth of elements."""
 MOST_FILES = 100
-"""XML files of a model, at most; a file that includes itself has more."""
+"""Maximum number of XML files of a model. A file that includes itself exceeds it."""
 MOST_PARTS = 6_000
-"""Parts of a model with all their replicas, at most: the time in which MuJoCo reads them grows with
-the square of their number."""
+"""Maximum number of parts of a model, including all replicas.
+
+The time in which MuJoCo reads them grows with the square of their number.
+"""
 PARTS = ("body", "composite", "flexcomp", "geom", "joint", "link", "site")
 REPEATING = ("replicate", "composite", "flexcomp")
 GRID_CELLS = 4_000_000
-"""Cells of one height field or texture, at most: MuJoCo allocates them while it parses (20000 x
-20000 takes 10 s)."""
+"""Maximum number of cells of a height field or texture.
+
+MuJoCo allocates them while it parses (20000 x 20000 takes 10 s).
+"""
 GRIDS = (("nrow", "ncol"), ("width", "height"))
 PNG = b"\x89PNG\r\n\x1a\n"
 EXPAND = "expand it first: xacro IN > arm.urdf"
@@ -48,44 +52,45 @@ NUMBERS = (
 )
 """Numeric attributes in links and joints of a URDF."""
 LIMITS = ("range", "cutoff", "effort")
-"""Endings of attribute names whose value may be infinite, meaning no limit."""
+"""Endings of attribute names whose value may be infinite, which means no limit."""
 FASTEST = 1e9
-"""Velocity that no joint has, rad/s or m/s."""
+"""Velocity that no joint reaches, rad/s or m/s."""
 
 
 class _Place(NamedTuple):
-    """The surroundings of an element."""
+    """Surroundings of an element."""
 
-    file: Path  # that contains it
-    owner: str  # kind and name of the nearest element around it that has a name
+    file: Path  # file that contains the element
+    owner: str  # kind and name of the nearest named element around it
     copies: float  # number of its replicas
-    depth: int
+    depth: int  # number of elements around it
 
 
 class ModelReader:
     """Reads the XML file of a model, and all files that it includes or attaches.
 
-    Elements and attributes with a prefix are left out: they belong to other programs.
+    Elements and attributes with a prefix are left out, because they are for other programs.
 
     Attributes:
-        root: Root of the model's own file.
-        texts: Content of all files, its own first, by the names under which MuJoCo finds them.
+        root: Root of the model's main file.
+        texts: Content of all files, the main file first, by the names under which MuJoCo finds
+            them.
     """
 
     def __init__(self, path: Path) -> None:
         """Read the files of a model.
 
         Args:
-            path: The model's own file.
+            path: The model's main file.
 
         Raises:
-            RobotError: A file is missing, malformed, too large or no regular file, or includes one
-                outside its folder; a number cannot be used; there are too many parts.
+            RobotError: A file is missing, malformed, too large or not a regular file, or includes a
+                file outside its folder; a number is invalid; or there are too many parts.
         """
         self._files: dict[str, tuple[Path, ElementTree.Element]] = {}
         self._models: dict[str | None, str] = {}  # names of attached files
-        self._assets: set[tuple[Path, str]] = set()  # folder of a model, and what it names
-        self._folders = {""}  # of assets
+        self._assets: set[tuple[Path, str]] = set()  # folder of a model, and a file it names
+        self._folders = {""}  # folders of assets
         self._bytes = 0
         self._parts = 0.0
         self.root = self._read(path, path.resolve().parent)
@@ -98,7 +103,7 @@ class ModelReader:
         }
 
     def _read(self, path: Path, folder: Path) -> ElementTree.Element:
-        """Read a file of a model in this folder, and the files that it refers to."""
+        """Read a file of a model in `folder`, and the files to which it refers."""
         try:
             text = read_regular_file(path, MODEL_BYTES - self._bytes)
             root = parse_xml(text)
@@ -125,28 +130,28 @@ class ModelReader:
         return root
 
     def _refer(self, element: ElementTree.Element, path: Path, folder: Path) -> None:
-        """Read the file to which an element refers, and let it refer to the text of that file.
+        """Read the file to which an element refers, and point the element to the checked text.
 
         Args:
-            element: It includes the file, or declares it as a model to attach.
+            element: Includes the file, or declares it as a model to attach.
             path: File that contains the element.
             folder: Folder of the model.
         """
         name = element.get("file", "")
         places = (folder / name, path.resolve().parent / name)
-        found = find_file(places) or places[0]
-        own = f"{len(self._files)}.xml"
+        target = find_file(places) or places[0]
+        text_name = f"{len(self._files)}.xml"
         if element.tag == "model":
-            self._models[element.get("name")] = own
-            folder = found.resolve().parent
-        elif not found.resolve().is_relative_to(folder):
+            self._models[element.get("name")] = text_name
+            folder = target.resolve().parent
+        elif not target.resolve().is_relative_to(folder):
             raise RobotError(f"model '{path}': include '{name}' leaves the model's folder")
-        self._read(found, folder)
-        # MuJoCo looks for texts by the last part of a path.
-        element.set("file", str(Path(name).with_name(own)))
+        self._read(target, folder)
+        # MuJoCo finds texts by the last part of their path.
+        element.set("file", str(Path(name).with_name(text_name)))
 
     def _check(self, element: ElementTree.Element, place: _Place) -> None:
-        """Check an element, and all in it or to which it refers, with the number of replicas."""
+        """Check an element and everything in it or to which it refers, and count replicas."""
         file, owner, copies, depth = place
         tag = element.tag
         if name := element.get("name"):
@@ -164,17 +169,21 @@ class ModelReader:
         for child in element:
             self._check(child, _Place(file, owner, copies, depth + 1))
         refers = {"include": element.get("file"), "attach": self._models.get(element.get("model"))}
-        if own := refers.get(tag):
-            inner, root = self._files[own.rpartition("/")[2]]
+        if text_name := refers.get(tag):
+            inner, root = self._files[text_name.rpartition("/")[2]]
             self._check(root, _Place(inner, owner, copies, depth + 1))
 
     def _check_assets(self, model: Path) -> None:
         """Check that meshes, images and height fields are regular files of bounded size."""
         for folder, name in self._assets:
             places = [folder / place for place in sorted(self._folders)]
-            # MuJoCo strips paths of Windows as well.
-            own = PureWindowsPath(name)
-            files = [place / part for place in places for part in (own.as_posix(), own.name)]
+            # MuJoCo also strips Windows paths.
+            asset = PureWindowsPath(name)
+            files = [
+                place / file_name
+                for place in places
+                for file_name in (asset.as_posix(), asset.name)
+            ]
             if find_file(files) is None:
                 looked = ", ".join(map(str, places))
                 raise RobotError(f"model '{model}': no file '{name}'; looked for in {looked}")
@@ -184,17 +193,17 @@ class ModelReader:
 
 
 def parse_xml(text: bytes) -> ElementTree.Element:
-    """Parse a file, but for elements and attributes with a prefix, declared or not.
+    """Parse a file, leaving out elements and attributes with a prefix, declared or not.
 
-    Every start tag remains on its line, which MuJoCo names in its messages.
+    Every start tag stays on its line, because MuJoCo names the line in its messages.
 
     Raises:
-        ExpatError: It is malformed.
-        ValueError: It declares entities, or holds xacro that is not expanded.
+        ExpatError: The text is malformed.
+        ValueError: The text declares entities, or contains xacro that is not expanded.
     """
     builder = ElementTree.TreeBuilder()
     parser = expat.ParserCreate()
-    foreign = 0  # depth within an element with a prefix
+    foreign = 0  # nesting depth within an element with a prefix
     line = 1
 
     def start(tag: str, attributes: dict[str, str]) -> None:
@@ -227,7 +236,7 @@ def parse_xml(text: bytes) -> ElementTree.Element:
 
 
 def find_file(paths: Iterable[Path]) -> Path | None:
-    """Return the first path that exists, and that the system does not refuse, as one too long."""
+    """Return the first path that exists. None if there is none."""
     for path in paths:
         with suppress(OSError):
             path.stat()
@@ -236,8 +245,10 @@ def find_file(paths: Iterable[Path]) -> Path | None:
 
 
 def check_asset(file: Path, model: Path) -> None:
-    """Raise `RobotError` for an asset of a model that is no regular file, or too large, also once
-    it is decoded.
+    """Check that an asset of a model is a regular file, and not too large, even when decoded.
+
+    Raises:
+        RobotError: It is not.
     """
     try:
         check_regular_file(file, ASSET_BYTES)
@@ -250,24 +261,30 @@ def check_asset(file: Path, model: Path) -> None:
 
 
 def _mistakes(element: ElementTree.Element, owner: str, is_urdf: bool) -> Iterator[str]:
-    """Yield the mistakes of one element, of `owner`: an invalid number, a grid too large."""
+    """Yield descriptions of mistakes in an element, such as an invalid number or too large a grid.
+
+    Args:
+        element: The element.
+        owner: Kind and name of the nearest named element.
+        is_urdf: Whether the file is a URDF.
+    """
     place = owner if "name" in element.attrib else f"<{element.tag}>" + f" of {owner}" * bool(owner)
     is_part = owner.startswith(("link", "joint"))
     for key, value in element.items():
-        found = numbers(value)
+        values = numbers(value)
         is_wrong = key != "name" and not all(
-            math.isfinite(x) or (math.isinf(x) and key.endswith(LIMITS)) for x in found
+            math.isfinite(x) or (math.isinf(x) and key.endswith(LIMITS)) for x in values
         )
         valid = "finite numbers"
         if is_urdf:
-            is_wrong |= not len(value.split()) == len(found) == (3 if key in VECTORS else 1)
-            is_wrong |= key == "velocity" and not 0.0 <= min(found, default=0.0) < FASTEST
+            is_wrong |= not len(value.split()) == len(values) == (3 if key in VECTORS else 1)
+            is_wrong |= key == "velocity" and not 0.0 <= min(values, default=0.0) < FASTEST
             is_wrong &= is_part and key in NUMBERS
             valid = "3 finite numbers" if key in VECTORS else "a finite number, such as 2.5"
             valid += f", from 0 to {FASTEST:g}" * (key == "velocity")
         if is_wrong:
             hint = f"; {EXPAND}" * ("$" in value)
-            yield f"{place}: {key} = '{value[:60]}'; valid: {valid}{hint}"
+            yield f"{place}: {key} = '{value[:60]}'; it must be {valid}{hint}"
     for keys in [(key,) for key in element.attrib] if element.tag == "size" else GRIDS:
         cells = math.prod(max(numbers(element.get(key, "0")), default=0.0) for key in keys)
         if cells > GRID_CELLS:
@@ -275,9 +292,9 @@ def _mistakes(element: ElementTree.Element, owner: str, is_urdf: bool) -> Iterat
 
 
 def numbers(text: str) -> list[float]:
-    """Return the numbers among the words of an attribute; nan(7), as C reads it, is one of them."""
-    found = []
+    """Return the words of an attribute that are numbers. In C syntax, nan(7) is a number."""
+    values = []
     for word in text.split():
         with suppress(ValueError):
-            found.append(float(word.partition("(")[0]))
-    return found
+            values.append(float(word.partition("(")[0]))
+    return values

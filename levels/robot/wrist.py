@@ -1,6 +1,4 @@
-"""The wrist sensor of an arm, as the model describes it: where it is, its range, and the limits on
-contact.
-"""
+"""The wrist sensor of an arm as the model describes it, and limits on contact."""
 
 from __future__ import annotations
 
@@ -18,24 +16,35 @@ KINDS = {
     "force": (mujoco.mjtSensor.mjSENS_FORCE, "N"),
     "torque": (mujoco.mjtSensor.mjSENS_TORQUE, "N m"),
 }
-"""Kind of sensor and unit of both halves."""
+"""Kinds of MuJoCo sensors, and their units."""
 
 
 class Wrist(NamedTuple):
-    """A force/torque sensor at a site. Forces are N, torques N m; of two values the first is the
-    force's.
+    """A force/torque sensor at a site.
+
+    Forces are in N, torques in N m. Pairs of values are for force and torque.
     """
 
     site: int
-    addresses: Ints  # (6,), of its numbers in sensordata
-    range: tuple[float, float]  # of each component, both ways
-    most: tuple[float, float]  # of a contact: beyond it the arm stops
+    addresses: Ints  # (6,), addresses of its values in sensordata
+    range: tuple[float, float]  # largest value of a component, in both directions
+    most: tuple[float, float]  # force and torque of a contact at which the arm stops
     noise: tuple[float, float]  # standard deviation of a component
 
 
 def find_wrist(model: mujoco.MjModel, config: WristConfig | None, moved: Mask) -> Wrist | None:
-    """Return the sensor on one of the bodies `moved` (nbody,) by the arm; None: there is none.
-    Raises `RobotError`.
+    """Find the sensor in the compiled model.
+
+    Args:
+        model: The compiled model.
+        config: The `[robot.wrist]` table. None if the arm has no sensor.
+        moved: Bodies that the arm moves, (nbody,).
+
+    Returns:
+        The sensor. None if the arm has none.
+
+    Raises:
+        RobotError: The sensor is missing, not on the arm, or has no range.
     """
     if config is None:
         return None
@@ -45,44 +54,49 @@ def find_wrist(model: mujoco.MjModel, config: WristConfig | None, moved: Mask) -
     if force != torque:
         sites = f"'{model.site(force).name}' and '{model.site(torque).name}'"
         raise RobotError(
-            f"robot.wrist: force and torque are sensed at two sites, {sites}; one is valid"
+            f"robot.wrist: force and torque are sensed at two sites, {sites}, instead of one"
         )
     if not moved[model.site_bodyid[force]]:
         raise RobotError(
             f"robot.wrist: site '{model.site(force).name}' is on a body that the arm does not move"
         )
-    most = (config.most_force, config.most_torque)
+    contact_limits = (config.most_force, config.most_torque)
     reaches = model.sensor_cutoff[sensors].tolist()
     for (key, (_, unit)), name, reach, limit in zip(
-        KINDS.items(), names, reaches, most, strict=True
+        KINDS.items(), names, reaches, contact_limits, strict=True
     ):
         if not reach > 0.0:
             raise RobotError(
-                f"robot.wrist.{key}: sensor '{name}' has no range; give it a cutoff, {unit}"
+                f"robot.wrist.{key}: sensor '{name}' has no range; set its cutoff, {unit}"
             )
         if limit > reach:
             raise RobotError(
-                f"robot.wrist.most_{key}: {limit:g} {unit} is beyond the sensor's range; at"
-                f" most {reach:g} is valid"
+                f"robot.wrist.most_{key}: {limit:g} {unit} is beyond the sensor's range; it"
+                f" must be at most {reach:g}"
             )
-    first = model.sensor_adr[sensors]
     return Wrist(
         site=force,
-        addresses=(first[:, None] + np.arange(3)).ravel().astype(int),
+        addresses=(model.sensor_adr[sensors, None] + np.arange(3)).ravel().astype(int),
         range=(reaches[0], reaches[1]),
-        most=most,
+        most=contact_limits,
         noise=(config.noise, 0.1 * config.noise),
     )
 
 
 def _sensor(model: mujoco.MjModel, key: str, name: str) -> int:
-    """Return the id of a sensor of kind `key`. Raises `RobotError`."""
-    found = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, name)
+    """Return the id of a sensor of kind `key`.
+
+    Raises:
+        RobotError: The model has no such sensor.
+    """
+    number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, name)
     is_kind = model.sensor_type == KINDS[key][0]
-    if found >= 0 and is_kind[found]:
-        return int(found)
+    if number >= 0 and is_kind[number]:
+        return int(number)
     have = listed([model.sensor(int(k)).name for k in np.flatnonzero(is_kind)])
     why = (
-        f"sensor '{name}' is no {key} sensor" if found >= 0 else f"no sensor '{name}' in the model"
+        f"sensor '{name}' is not a {key} sensor"
+        if number >= 0
+        else f"no sensor '{name}' in the model"
     )
     raise RobotError(f"robot.wrist.{key}: {why}; it has these {key} sensors: {have}")

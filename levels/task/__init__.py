@@ -1,4 +1,4 @@
-"""The task level: a program of actions on objects becomes elemental moves."""
+"""The task level, which decomposes a program of actions on objects into elemental moves."""
 
 from rack.levels.task.executor import TaskExecutor
 from rack.levels.task.planner import TaskPlanner

@@ -1,4 +1,4 @@
-"""Actions as elemental moves: of the ways to do an action, the quickest that succeeds."""
+"""Actions as elemental moves. Of the ways to do an action, the quickest feasible one is used."""
 
 from __future__ import annotations
 
@@ -23,33 +23,43 @@ from rack.levels.task.rehearsal import Rehearsal
 Option = TypeVar("Option")
 
 TURNS = 8
-"""Turns about the tool's z axis that are tried where only its direction is given."""
+"""Number of turns about the tool's z axis that are tried if only its direction is given."""
 MAX_WAYS = 16
-"""Ways to do an action that are planned completely."""
+"""Maximum number of ways to do an action for which all motions are planned."""
 LEANING_RESTARTS = 20
-"""Random starts of the inverse kinematics for a tool that leans, of which many poses are out of
-reach: of 7,100 poses in reach in layouts that the PUMA refuses, so few missed 80."""
+"""Random starts of the inverse kinematics for a tool that leans.
+
+Many of its poses are out of reach. Of 7,100 reachable poses in layouts that the PUMA refuses, this
+number missed 80.
+"""
 HALVINGS = 7
-"""Bisections in the search for a reachable place on the way to one that is not."""
+"""Bisections in the search for a reachable place on the way to an unreachable one."""
 
 
 class Spot(NamedTuple):
-    """A pose of the tool at an object."""
+    """Pose of the tool at an object."""
 
     tool: Pose
     above: Array  # a configuration straight above it, (joints,), rad
 
 
 class Way(NamedTuple):
-    """Where a transfer takes the object and where it puts it down."""
+    """Spots at which a transfer takes the object and puts it down."""
 
     take: Spot
     put: Spot
 
 
 def rehearse(program: TaskConfig, scene: SceneConfig, start: Rehearsal) -> Rehearsal:
-    """Return the whole program as moves, rehearsed. Raises `Refused` with action, place and a
-    possible alternative.
+    """Plan a whole program as moves.
+
+    Args:
+        program: The program.
+        scene: The `[scene]` table.
+        start: Rehearsal without moves, at the start of the program.
+
+    Raises:
+        Refused: An action cannot be done. The reason names the place, and a possible alternative.
     """
     rehearsal = start
     for k, action in enumerate(program.action):
@@ -66,7 +76,7 @@ def rehearse(program: TaskConfig, scene: SceneConfig, start: Rehearsal) -> Rehea
 
 @contextmanager
 def _naming(k: int, step: str) -> Iterator[None]:
-    """Give a refusal the number of its action, and its reason the refused step."""
+    """Add the number of the action and the step to a refusal."""
     try:
         yield
     except Refused as refused:
@@ -74,7 +84,16 @@ def _naming(k: int, step: str) -> Iterator[None]:
 
 
 def goto(rehearsal: Rehearsal, k: int, action: Goto) -> Rehearsal:
-    """Return the rehearsal after a goto. Raises `Refused`."""
+    """Return the rehearsal after a goto.
+
+    Args:
+        rehearsal: Rehearsal of the actions before it.
+        k: Number of the action.
+        action: The goto.
+
+    Raises:
+        Refused: The goal cannot be reached.
+    """
     if action.joints is not None:
         return rehearsal.then(k, Verb.MOVE_JOINTS, joints=np.array(action.joints))
     assert action.position is not None, "a goto has joints or a position"
@@ -82,8 +101,8 @@ def goto(rehearsal: Rehearsal, k: int, action: Goto) -> Rehearsal:
     rehearsal.situation.lay_out(motion.checker, None)
     if action.direction == "any":
         place = pose(action.position, pointing(DOWN))
-        anyhow = motion.ik.reachable(place, rehearsal.q, match_orientation=False)
-        tools = [motion.ik.tool_at(q) for q in anyhow] or [place]
+        reachable = motion.ik.reachable(place, rehearsal.q, match_orientation=False)
+        tools = [motion.ik.tool_at(q) for q in reachable] or [place]
     elif action.quaternion is not None:
         tools = [pose(action.position, action.quaternion)]
     else:
@@ -103,8 +122,16 @@ def goto(rehearsal: Rehearsal, k: int, action: Goto) -> Rehearsal:
 
 
 def transfer(rehearsal: Rehearsal, k: int, action: Transfer, scene: SceneConfig) -> Rehearsal:
-    """Return the rehearsal after a transfer. Raises `Refused` that names the step, pick or
-    place.
+    """Return the rehearsal after a transfer.
+
+    Args:
+        rehearsal: Rehearsal of the actions before it.
+        k: Number of the action.
+        action: The transfer.
+        scene: The `[scene]` table.
+
+    Raises:
+        Refused: The transfer cannot be done. The reason names the step, pick or place.
     """
     handling = Handling(rehearsal, scene.objects.index(action.object), action.lift)
     pick = f"pick {action.object}"
@@ -139,17 +166,20 @@ def transfer(rehearsal: Rehearsal, k: int, action: Transfer, scene: SceneConfig)
 
 
 class Handling(NamedTuple):
-    """A transfer as planning sees it: the tool goes straight down to the object and straight up
-    again.
+    """A transfer as planning sees it.
+
+    The tool moves straight down to the object and straight up again.
     """
 
     start: Rehearsal
-    row: int  # of the object
+    row: int  # row of the object
     lift: float  # height of the straight motions, m
 
     def takes(self) -> Iterator[list[Spot]]:
-        """Yield the spots to take and hold the object, at the lowest possible height first. Raises
-        the first `Refused` when there are none.
+        """Yield spots at which the object can be taken and held, lowest height first.
+
+        Raises:
+            Refused: There are no spots. The reason is the first refusal.
         """
         start = self.start
         refusal: Refused | None = None
@@ -175,33 +205,46 @@ class Handling(NamedTuple):
             raise refusal
 
     def ways(self, takes: list[Spot], standing_goals: list[Pose]) -> list[Way]:
-        """Return ways to do the transfer, the quickest to move first. Raises `Refused` when there
-        is none.
+        """Return ways to do the transfer, those with the shortest motion first.
+
+        `standing_goals` are poses in which the object may be put down.
+
+        Raises:
+            Refused: There is no way.
         """
         situation = self.start.situation
-        here = self.start.q
+        start_q = self.start.q
         ways: list[Way] = []
         puts: list[tuple[Pose, list[Spot]]] = []
         for take in takes:
             grip = take.tool.inverse() @ situation.object_pose(self.row)
-            room = SLIP_M if leans(take.tool) else 0.0
+            slip_m = SLIP_M if leans(take.tool) else 0.0
             for goal in standing_goals:
-                tool = goal.raised(room) @ grip.inverse()
-                same = next((spots for known, spots in puts if known.is_near(tool)), None)
-                if same is None:
-                    same = self._spots(tool, situation.holding(self.row, grip))
-                    puts.append((tool, same))
-                ways += [Way(take, put) for put in same]
+                tool = goal.raised(slip_m) @ grip.inverse()
+                spots = next((spots for known, spots in puts if known.is_near(tool)), None)
+                if spots is None:
+                    spots = self._spots(tool, situation.holding(self.row, grip))
+                    puts.append((tool, spots))
+                ways += [Way(take, put) for put in spots]
         if not ways:
             raise self._nothing_at([tool for tool, _ in puts])
-        pace = self.start.motion.ik.time_between
+        time_s = self.start.motion.ik.time_between
         return sorted(
-            ways, key=lambda way: pace(here, way.take.above) + pace(way.take.above, way.put.above)
+            ways,
+            key=lambda way: time_s(start_q, way.take.above) + time_s(way.take.above, way.put.above),
         )
 
     def moved(self, rehearsal: Rehearsal, k: int, spot: Spot, verb: Verb) -> Rehearsal:
-        """Return the rehearsal after the four moves of a grasp or a release for action `k`. Raises
-        `Refused`.
+        """Return the rehearsal after the four moves of a grasp or a release.
+
+        Args:
+            rehearsal: Rehearsal of the moves before them.
+            k: Number of the action.
+            spot: Where the object is taken or put down.
+            verb: GRASP or RELEASE.
+
+        Raises:
+            Refused: A move cannot be done.
         """
         above = spot.tool.raised(self.lift)
         row = self.row
@@ -212,8 +255,9 @@ class Handling(NamedTuple):
         return rehearsal.then(k, Verb.DEPART, tool=above, row=row)
 
     def _spots(self, tool: Pose, situation: Situation, grasps: bool = False) -> list[Spot]:
-        """Return the free configurations above `tool` from which the arm can come down to it and,
-        if it `grasps` there, close the gripper.
+        """Return spots at `tool` from which the arm can come down to it without collision.
+
+        If it `grasps` an object there, the gripper can also close.
         """
         motion = self.start.motion
         situation.lay_out(motion.checker, None)
@@ -230,8 +274,10 @@ class Handling(NamedTuple):
         return [Spot(tool, q) for q, _ in free]
 
     def _held(self, takes: list[Spot]) -> list[Spot]:
-        """Return the spots where gripper and motors can hold the object. Raises the first `Refused`
-        when none can.
+        """Return the spots at which gripper and motors can hold the object.
+
+        Raises:
+            Refused: There are no such spots. The reason is the first refusal.
         """
         payloads = self.start.motion.payloads
         seen = self.start.situation.object_pose(self.row)
@@ -250,16 +296,18 @@ class Handling(NamedTuple):
         return held
 
     def _nothing_at(self, tools: list[Pose]) -> Refused:
-        """Return the refusal for poses that the arm cannot reach from above, or only in
-        collision.
-        """
+        """Return the refusal for tool poses that cannot be reached from above without collision."""
         places = [place for tool in tools for place in (tool, tool.raised(self.lift))]
         return _nothing_at(self.start.motion, places, self.start.q)
 
 
 def _first(options: Iterable[Option], do: Callable[[Option], Rehearsal]) -> Rehearsal:
-    """Return the first rehearsal that succeeds. Raises the `Refused` of the first option when none
-    does.
+    """Return the first rehearsal that succeeds.
+
+    `do` rehearses an option.
+
+    Raises:
+        Refused: No option succeeds. The refusal is from the first option.
     """
     refusals: list[Refused] = []
     for option in options:
@@ -271,7 +319,7 @@ def _first(options: Iterable[Option], do: Callable[[Option], Rehearsal]) -> Rehe
 
 
 def _nothing_at(motion: MotionPlanner, tools: list[Pose], here: Array) -> Refused:
-    """Return the refusal for poses that the arm cannot reach, or only in collision."""
+    """Return the refusal for tool poses that cannot be reached without collision."""
     beyond: Pose | None = None
     for tool in tools:
         reachable = motion.ik.reachable(tool, here)

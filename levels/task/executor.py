@@ -23,9 +23,10 @@ from rack.levels.task.window import Detour, ShownWindow
 
 
 class TaskExecutor(Executor):
-    """Reports the program done, or the error that ended it: refused, failed below, late or stalled.
+    """Hands down the moves of the plan and reports when the program is done.
 
-    An operator may hold it, or send the arm elsewhere between two of its moves.
+    It also reports the error that ends the program: refused, failed below, late or stalled. An
+    operator may hold the program, or send the arm elsewhere between two moves.
     """
 
     below = Input(MoveStatus, "below.status")
@@ -45,20 +46,20 @@ class TaskExecutor(Executor):
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         self._actions = self._first_actions()
-        self._ahead_s = 0.0  # the time of the program's `by`, less simulated time here
+        self._ahead_s = 0.0  # clock of the program's `by` minus simulated time
         self._stalled_s = read_params(self.params, context.params).stalled_s
         self._orders = Orders(self.commands)
         self._window = ShownWindow()
         self._detour = Detour(context.robot, self._orders, self._window)
         self._started = False
-        self._done = 0  # moves of the plan done
+        self._done = 0  # completed moves of the plan
         self._error = Error.NONE
         self._reason = ""
-        self._progress: tuple[float, ...] = ()  # all values that change while anything moves
-        self._moved_at = 0  # tick of the last such change
+        self._progress: tuple[float, ...] = ()  # values that change while anything moves
+        self._moved_at = 0  # tick of their last change
 
     def process(self, tick: int) -> None:
-        """Read the progress below, and the operator's commands; hand down the next moves."""
+        """Read progress and operator's commands, and hand down the next moves."""
         if not self._started:
             self._recall()
         self._orders.take(
@@ -86,17 +87,15 @@ class TaskExecutor(Executor):
         self._answer(below)
 
     def _first_actions(self) -> tuple[AnyAction, ...]:
-        """Return the actions with which the level begins: its whole program."""
+        """Return the initial actions, which are the whole program."""
         return read_program(self.context.task, self.context.robot, self.context.scene).action
 
     def _plan_to_follow(self, tick: int) -> TaskPlan:
-        """Return the `TaskPlan` of the present actions; one of zeros if there is none yet."""
+        """Return the plan of the present actions, with all fields 0 if there is none yet."""
         return self.plan.message
 
     def _recall(self) -> None:
-        """Continue from the last command and status in the mailboxes, after a restart of the
-        board.
-        """
+        """Restore the state from the last command and status, after a restart of the board."""
         self._started = True
         last = self.last_status.message
         self._done = last.moves_done
@@ -108,13 +107,15 @@ class TaskExecutor(Executor):
             self._detour = Detour(self.context.robot, self._orders, self._window, last.detour)
 
     def _judge(self, command: OperatorCommand, answered: int) -> None:
-        """Accept or refuse a goto; one already answered before a restart of this board is not
-        new.
+        """Accept or refuse a goto.
+
+        A goto that was answered before a restart of this board is not new.
         """
         if self._orders.standing is Operation.GOTO:
             self._detour.begin(command, command.id > answered)
 
     def _follow(self, plan: TaskPlan, below: MoveStatus) -> None:
+        """Count completed moves, and detect errors of the plan and the level below."""
         if plan.error:
             self._error = Error(plan.error)
             self._reason = plan.reason
@@ -127,7 +128,7 @@ class TaskExecutor(Executor):
             self._reason = self._about(action, f": {below.reason}")
 
     def _about(self, action: int, why: str) -> str:
-        """Return a reason with the number of its action; `why` begins with what separates them."""
+        """Return a reason with the number of its action. `why` begins with the separator."""
         return f"action {action}{why}"
 
     def _step_aside(self, plan: TaskPlan, below: MoveStatus) -> int:
@@ -135,8 +136,9 @@ class TaskExecutor(Executor):
         return self._detour.step(plan, self._done, below)
 
     def _reason_to_wait(self, below: Reading[MoveStatus]) -> str:
-        """Return the reason why the level waits, and the condition that ends the wait; empty: it
-        does not.
+        """Return why the level waits, and the condition that ends the wait.
+
+        Empty if it does not wait.
         """
         orders = self._orders
         if orders.standing is Operation.GOTO:
@@ -149,7 +151,7 @@ class TaskExecutor(Executor):
         return below.message.reason if is_held else ""
 
     def _check_progress(self, plan: TaskPlan, waits: str, tick: int) -> None:
-        """Fail when nothing has moved for too long, unless an operator keeps it from moving."""
+        """Fail if nothing has moved for too long, unless an operator prevents motion."""
         below = self.below.message
         reported = below.done, below.planned, below.current, below.progress
         progress = (plan.id, self._done, *reported, self._detour.move, *self._stage())
@@ -164,10 +166,11 @@ class TaskExecutor(Executor):
             )
 
     def _stage(self) -> tuple[int, ...]:
-        """Return what else counts as progress."""
+        """Return further values whose change counts as progress."""
         return ()
 
     def _actions_done(self, plan: TaskPlan) -> int:
+        """Return how many actions of the program are done."""
         if not plan.count:
             return 0
         if self._done == plan.count:
@@ -175,7 +178,7 @@ class TaskExecutor(Executor):
         return int(plan.moves["action"][self._done])
 
     def _hand_down(self, plan: TaskPlan, command: TaskCommand) -> None:
-        """Show the program's next moves, or the operator's goto."""
+        """Show the program's next moves, or the operator's goto, to the level below."""
         detour = self._detour
         if detour.move and detour.is_known and not self._error:
             self._window.show_one(detour.as_move(self._actions_done(plan)), command)
@@ -189,6 +192,7 @@ class TaskExecutor(Executor):
         return plan.count if self._detour.until is None else self._detour.until
 
     def _report(self, plan: TaskPlan, waits: str) -> None:
+        """Fill the status. `waits` is the reason to wait, or empty."""
         status = self.status
         status.echo = plan.id
         status.state = self._state(plan)
@@ -205,8 +209,9 @@ class TaskExecutor(Executor):
         status.detour = self._detour.move
 
     def _answer(self, below: MoveStatus) -> None:
-        """Obey and answer the operator, and pass down the newest command on which this cycle is
-        based.
+        """Obey and answer the operator.
+
+        The newest operator's command on which this cycle is based is passed down.
         """
         orders = self._orders
         self.command.hold = orders.holds or self._detour.holds
@@ -216,6 +221,7 @@ class TaskExecutor(Executor):
         orders.report(self.status)
 
     def _state(self, plan: TaskPlan) -> State:
+        """Return the state of the level, without holds."""
         if self._error:
             return State.ERROR
         if not self._actions:

@@ -22,34 +22,43 @@ UP = np.array([0.0, 0.0, 1.0])
 QUARTERS = (0, 1, -1, 2)
 """Quarter turns between object and gripper, in the order of trying."""
 TILTS_DEG = (*range(10, 91, 10), *range(15, 90, 10))
-"""Angles from straight down at which the tool may take an object that it cannot take so, in the
-order of trying."""
+"""Angles between the tool and straight down, in the order of trying.
+
+They are tried for an object that cannot be taken from straight above.
+"""
 FULL_ORIENTATION = 6
-"""Joints that bring the tool to a place in every orientation; one of fewer leans away from its
-base alone."""
+"""Number of joints with which the tool reaches a place in every orientation.
+
+An arm with fewer joints can only lean away from its base.
+"""
 HEIGHT_STEP_M = 0.01
-"""Spacing of grasps above the object's origin: a tall object is taken higher, so that the palm
-stays clear."""
+"""Spacing of grasps above the object's origin.
+
+A tall object is taken higher, so that the palm does not touch it.
+"""
 SET_DOWN_M = 0.0005
 """Gap between an object and its support when the gripper opens."""
 SLIP_M = 0.006
-"""What is added to it for a tool that leans: swung round, an object slips in the fingers by some
-mm, and would then be pressed on its support."""
+"""Addition to `SET_DOWN_M` for a tool that leans.
+
+An object that is swung around slips in the fingers by some millimetres, and would otherwise be
+pressed onto its support.
+"""
 LEAST_LEAN = 0.01
-"""1 - cosine of the least angle from straight down at which a tool leans."""
+"""1 - cosine of the angle from straight down above which a tool counts as leaning."""
 MAX_DISTANCE_M = 10.0
-"""Range in which distances between geoms are measured."""
+"""Maximum distance between geoms that is measured."""
 SKIN_M = 1e-6
-"""A ray that has hit the arm continues this far inside the surface."""
+"""Distance by which a ray that has hit the arm continues inside the surface."""
 MAX_STANDING_GAP_M = 0.02
-"""A goal farther than this above or below a standing height is a mistake in the program."""
+"""Distance of a goal from a standing height above which the program is refused."""
 
 
 def grasps(cell: Cell, situation: Situation, row: int) -> Iterator[list[Pose]]:
-    """Yield, from the lowest height up, the tool poses that take object `row`: straight down,
-    then leaning over each of its sides.
+    """Yield groups of tool poses that take object `row`, from the lowest height up.
 
-    The fingers close along the tool's y axis, across the object's x or y axis.
+    The poses straight down come first, then poses that lean over each side of the object. The
+    fingers close along the tool's y axis, across the object's x or y axis.
     """
     seen = situation.object_pose(row)
     yaws = [yaw_of(seen.quaternion) + quarter * np.pi / 2.0 for quarter in QUARTERS]
@@ -67,36 +76,44 @@ def grasps(cell: Cell, situation: Situation, row: int) -> Iterator[list[Pose]]:
 
 
 def leaning(yaw: float, tilt: float) -> Array:
-    """Return the quaternion of a tool that points down but for `tilt`, rad, towards `yaw`; its y
-    axis is level.
+    """Return the quaternion of a tool that points down, tilted by `tilt`, rad, towards `yaw`.
+
+    Its y axis is level.
     """
     across = math.sin(tilt)
     return pointing((across * math.cos(yaw), across * math.sin(yaw), -math.cos(tilt)), yaw)
 
 
 def leans(tool: Pose) -> bool:
-    """Return whether a tool does not point straight down."""
-    along = np.zeros(3)
-    mujoco.mju_rotVecQuat(along, UP, tool.quaternion)
-    return bool(1.0 + along[2] > LEAST_LEAN)
+    """Return True if a tool does not point straight down."""
+    axis = np.zeros(3)
+    mujoco.mju_rotVecQuat(axis, UP, tool.quaternion)
+    return bool(1.0 + axis[2] > LEAST_LEAN)
 
 
 def bearing(cell: Cell, position: Array) -> float:
-    """Return the direction, rad, in which the arm's first joint sees a position."""
+    """Return the direction of a position as seen from the arm's first joint, rad."""
     base = cell.start().xanchor[cell.model.dof_jntid[cell.dof[0]]]
     return math.atan2(position[1] - base[1], position[0] - base[0])
 
 
 def goals(action: Transfer, at: Pose, cell: Cell) -> Iterator[list[Pose]]:
-    """Yield the poses in which the object may be put down, in the order of trying: upright as it is
-    now, turned about the vertical by quarters, then by what lies between.
+    """Yield groups of poses in which the object may be put down, in the order of trying.
+
+    The object stays upright. It is turned about the vertical by quarter turns, then by angles in
+    between, unless the action states the angle.
+
+    Args:
+        action: The transfer.
+        at: Pose of the object before the transfer.
+        cell: The cell.
     """
     yaw = yaw_of(at.quaternion)
     if action.yaw is not None:
         yield [_turned(action, at, action.yaw - yaw)]
         return
     turns = [quarter * np.pi / 2.0 for quarter in QUARTERS]
-    between = [turn + part * np.pi / 8.0 for part in (2, 1, 3) for turn in turns]
+    between = [turn + eighths * np.pi / 8.0 for eighths in (2, 1, 3) for turn in turns]
     if len(cell.qpos) < FULL_ORIENTATION:
         turns.append(bearing(cell, np.array(action.to)) - bearing(cell, at.position))
     for group in (turns, between):
@@ -104,17 +121,23 @@ def goals(action: Transfer, at: Pose, cell: Cell) -> Iterator[list[Pose]]:
 
 
 def _turned(action: Transfer, at: Pose, turn: float) -> Pose:
-    """Return the pose of an object at its goal, turned by `turn`, rad, from how it is now."""
+    """Return the pose of an object at its goal, turned by `turn`, rad, from its present pose."""
     quaternion = np.zeros(4)
     mujoco.mju_mulQuat(quaternion, turned_about_z(turn), at.quaternion)
     return pose(action.to, quaternion)
 
 
 def standing(cell: Cell, data: mujoco.MjData, row: int, situation: Situation) -> Pose:
-    """Return the pose of object `row` in `situation`, for which `data` is changed, at the height at
-    which it stands on the support below it.
+    """Return the pose of an object at the height at which it stands on the support below it.
 
-    Raises `Refused` for a goal over no support, or far above or below one.
+    Args:
+        cell: The cell.
+        data: Work space, which is changed.
+        row: Row of the object.
+        situation: Poses of the objects, with the object at its goal.
+
+    Raises:
+        Refused: The goal is not over a support, or far above or below it.
     """
     model = cell.model
     _lay_out(cell, data, situation)
@@ -122,16 +145,16 @@ def standing(cell: Cell, data: mujoco.MjData, row: int, situation: Situation) ->
     name = model.body(cell.bodies[row]).name
     x, y, z = goal.position
     support = _geom_below(cell, data, row, goal.position)
-    if support not in cell.supports:
-        supports = ", ".join(f"'{geom_name(model, g)}'" for g in cell.supports) or "none"
+    if support not in cell.geoms.supports:
+        supports = ", ".join(f"'{geom_name(model, g)}'" for g in cell.geoms.supports) or "none"
         place = f"over '{geom_name(model, support)}'" if support >= 0 else "over nothing"
         raise Refused(
             Error.UNREACHABLE,
             f"at [{x:.3f}, {y:.3f}] '{name}' would be {place}; supports: {supports}",
         )
     gap = min(
-        mujoco.mj_geomDistance(model, data, int(part), support, MAX_DISTANCE_M, None)
-        for part in cell.parts(row)
+        mujoco.mj_geomDistance(model, data, int(geom), support, MAX_DISTANCE_M, None)
+        for geom in cell.parts(row)
     )
     if abs(gap) > MAX_STANDING_GAP_M:
         side = "above" if gap > 0 else "deep in"
@@ -143,16 +166,17 @@ def standing(cell: Cell, data: mujoco.MjData, row: int, situation: Situation) ->
 
 
 def _geom_below(cell: Cell, data: mujoco.MjData, row: int, point: Array) -> int:
-    """Return the first geom below `point` that is neither object `row` nor the arm; -1: there is
-    none.
+    """Return the first geom below a point that is neither object `row` nor part of the arm.
+
+    -1 if there is none.
     """
-    found = np.full(1, -1, dtype=np.int32)
+    geom = np.full(1, -1, dtype=np.int32)
     body = int(cell.bodies[row])
     begin = point.copy()
     while True:
-        distance = mujoco.mj_ray(cell.model, data, begin, np.array(DOWN), None, 1, body, found)
-        if found[0] not in cell.arm_geoms:
-            return int(found[0])
+        distance = mujoco.mj_ray(cell.model, data, begin, np.array(DOWN), None, 1, body, geom)
+        if geom[0] not in cell.geoms.arm:
+            return int(geom[0])
         begin[2] -= distance + SKIN_M
 
 
@@ -163,7 +187,7 @@ def _lay_out(cell: Cell, data: mujoco.MjData, situation: Situation) -> None:
 
 
 def _top(cell: Cell, situation: Situation, row: int) -> float:
-    """Return the height of the highest point of object `row`, from its bounding boxes, in m."""
+    """Return the height of the highest point of object `row`, from its bounding boxes, m."""
     data = cell.start()
     _lay_out(cell, data, situation)
     return farthest(cell.model, data, cell.parts(row), UP)

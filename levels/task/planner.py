@@ -1,6 +1,4 @@
-"""The planner of the task level: the whole program as elemental moves, or the reason why it cannot
-be done.
-"""
+"""The planner of the task level: plans the whole program as elemental moves, or refuses it."""
 
 from __future__ import annotations
 
@@ -22,12 +20,11 @@ from rack.levels.task.rehearsal import Rehearsal, Rehearsed, finish_times
 FIRST_PLAN = 1
 """Serial of the first plan."""
 MAX_REST_M_S = 0.01
-"""An object slower than this is at rest: its position can be planned with."""
+"""Speed below which an object is at rest, so that motions to it can be planned."""
 
 
 class TaskPlanner(Planner):
-    """Plans the program once, as soon as the position of the arm is known and the objects are at
-    rest.
+    """Plans the program once, when the arm's position is known and the objects are at rest.
 
     A program that cannot be done is refused before anything moves, with a possible alternative.
     """
@@ -42,24 +39,24 @@ class TaskPlanner(Planner):
 
     @classmethod
     def preload(cls) -> None:
-        """Load the motion planner: OMPL is slow to import, so the boards inherit it."""
+        """Load the motion planner once for all boards, because OMPL is slow to import."""
         from rack.levels.planning import motion_planner
 
         motion_planner.preload()
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        # OMPL takes time and memory to import: only racks that plan motions pay for it.
+        # OMPL takes time and memory to import, so only racks that plan motions import it.
         from rack.levels.planning.motion_planner import MotionPlanner
 
         self._program = self._first_program()
         self._id = FIRST_PLAN
-        self._ahead_s = 0.0  # the time of the program's `by`, less simulated time here
+        self._ahead_s = 0.0  # clock of the program's `by` minus simulated time
         self._needs = read_params(self.params, context.params)
         cell = cell_of(context)
         self._motion = MotionPlanner(cell, context.scene, context.seed)
         self._plan: TaskPlan | None = None  # made by this process
-        self._visible_at = 0  # tick from which it is visible
+        self._visible_at = 0  # tick from which that plan is visible
         self._since: int | None = None  # tick of the first cycle
 
     def _first_program(self) -> TaskConfig:
@@ -67,7 +64,7 @@ class TaskPlanner(Planner):
         return read_program(self.context.task, self.context.robot, self.context.scene)
 
     def wanted(self, tick: int) -> bool:
-        """Return whether the program is still to be planned and the world is known and at rest."""
+        """Return True if the program has no plan yet, and the world is known and at rest."""
         self._since = tick if self._since is None else self._since
         followed = self.status.message.echo == self._id
         if not self._program.action or followed or self._is_on_its_way(tick, self._since):
@@ -81,8 +78,9 @@ class TaskPlanner(Planner):
         return bool(np.all(speeds < MAX_REST_M_S))
 
     def plan(self, tick: int) -> None:
-        """Decompose the whole program into `output`, or refuse it; a lost plan is published
-        again.
+        """Plan the whole program into `output`, or refuse it.
+
+        A plan that was lost is published again.
         """
         self._visible_at = tick + self._slice
         if self._plan is not None:
@@ -104,19 +102,22 @@ class TaskPlanner(Planner):
 
     @property
     def _slice(self) -> int:
+        """Ticks that the computation of a plan may take."""
         return self.context.within_cycles * self.context.every
 
     def _is_on_its_way(self, tick: int, since: int) -> bool:
-        """Return whether the executor may still report a plan: of this process, or of one before
-        it.
+        """Return True if the executor may still report a published plan.
+
+        The plan may be from this process or an earlier one. `since` is the tick of the first cycle.
         """
         if self._plan is not None:
-            # Once visible, the status acknowledges it a cycle later.
+            # The status acknowledges a plan one cycle after it becomes visible.
             return tick <= self._visible_at + self.context.every
         # A plan published just before a restart of this planner becomes visible later.
         return self.made.message.id == self._id or 0 < since <= tick < since + self._slice
 
     def _decompose(self, tick: int) -> None:
+        """Rehearse the program and write its moves into `output`. Raises `Refused`."""
         from rack.levels.task.actions import rehearse
 
         world = self.world.message
@@ -134,16 +135,15 @@ class TaskPlanner(Planner):
         self.output.count = len(moves)
 
     def _visible_s(self, tick: int) -> float:
-        """Return when the first moves of a plan begun at `tick` become visible below, s of
-        simulated time here.
-        """
-        # It is ready within its cycles, is read and handed down at once, and is visible below a
-        # cycle later.
+        """Return when the first moves of a plan begun at `tick` become visible below, s."""
+        # The plan is ready within its cycles, is read and handed down at once, and is visible below
+        # a cycle later.
         return (tick + (self.context.within_cycles + 1) * self.context.every) * self.context.tick_s
 
     def _with_times(self, moves: Sequence[Rehearsed]) -> list[Rehearsed]:
-        """Set the time by which the last move of each action must be done below, for this level to
-        report in time.
+        """Set the time by which the last move of each action must be done.
+
+        It leaves this level time to report.
         """
         timed = list(moves)
         for k, (move, duration_s) in enumerate(moves):
@@ -157,8 +157,10 @@ class TaskPlanner(Planner):
         return timed
 
     def _promise(self, moves: Sequence[Rehearsed], visible_s: float) -> None:
-        """Raise `Refused` with the earliest possible time if an action cannot be done by its
-        time.
+        """Check that every action can be done by its time.
+
+        Raises:
+            Refused: An action cannot. The text has the earliest possible time.
         """
         finish_s = finish_times(moves, visible_s, self.context, self._needs)
         for (move, _), finished_s in zip(moves, finish_s, strict=True):

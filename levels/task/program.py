@@ -1,6 +1,4 @@
-"""The task in a config: the `[task]` table, a program of actions, and the parameters of the
-level.
-"""
+"""The task in a config: the `[task]` table with its program, and the parameters of the level."""
 
 from __future__ import annotations
 
@@ -13,13 +11,13 @@ from rack.levels.level import Misfits, Program
 from rack.levels.tables import Finite, GoalConfig, Positive, RobotConfig, SceneConfig, Table, Vector
 
 ROUNDING_S = 1e-9
-"""Margin of times against deadlines: ticks times the clock's period are not exact."""
+"""Tolerance of comparisons with deadlines, s, as ticks times the clock's period are rounded."""
 DOWN = (0.0, 0.0, -1.0)
-"""Direction of the tool's z axis when none is given."""
+"""Default direction of the tool's z axis."""
 
 
 class Action(Table):
-    """Base of all actions."""
+    """Base class of all actions."""
 
     by: Positive | None = None
     """simulated time by which the action must be done, s"""
@@ -33,9 +31,9 @@ class Transfer(Action):
     object: str
     """object of the scene"""
     to: Vector
-    """where the object's origin goes, m"""
+    """final position of the object's origin, m"""
     yaw: Finite | None = None
-    """turn of the object's x axis there, rad; free when not given"""
+    """final angle of the object's x axis, rad; free if not given"""
     lift: Positive = 0.1
     """height of the straight motion above grasp and release, m"""
 
@@ -53,8 +51,8 @@ class Goto(Action):
     quaternion: tuple[Finite, Finite, Finite, Finite] | None = None
     """of the tool, as w, x, y, z"""
     direction: Vector | Literal["any"] | None = None
-    """of the tool's z axis, any turn about it; down when not given; 'any': an arm of five joints or
-    fewer reaches most places in few orientations"""
+    """of the tool's z axis, with any turn about it; default: down; with 'any' the orientation is
+    free, as an arm with fewer than six joints reaches most places in few orientations"""
     joints: tuple[Finite, ...] | None = None
     """joint positions, rad"""
 
@@ -68,7 +66,7 @@ class Goto(Action):
             raise ValueError("a goto with joints has no quaternion and no direction")
         for name in ("quaternion", "direction"):
             if getattr(self, name) not in (None, "any") and not any(getattr(self, name)):
-                raise ValueError(f"{name} is all zero; its length must not be zero")
+                raise ValueError(f"{name} is zero; its length must not be zero")
         return self
 
     def __str__(self) -> str:
@@ -78,7 +76,7 @@ class Goto(Action):
 
 
 class Home(Action):
-    """Move the arm back to its start."""
+    """Move the arm back to its home position."""
 
     do: Literal["home"] = "home"
     """the kind of action"""
@@ -91,19 +89,19 @@ AnyAction = Annotated[Transfer | Goto | Home, Field(discriminator="do")]
 
 
 class TaskConfig(Program):
-    """A program: actions in their order."""
+    """A program of actions, done in their order."""
 
     action: tuple[AnyAction, ...] = ()
     """actions, done in their order"""
 
     def goals(self) -> Iterator[GoalConfig]:
-        """Yield where transfers take objects."""
+        """Yield the final positions of all transferred objects."""
         for action in self.action:
             if isinstance(action, Transfer):
                 yield GoalConfig(object=action.object, position=action.to)
 
     def misfits(self, robot: RobotConfig | None, scene: SceneConfig) -> Misfits:
-        """Yield key, value and reason of everything that the arm or the scene lacks."""
+        """Yield key, value and reason of every entry that does not suit arm or scene."""
         if robot is None:
             return
         for k, action in enumerate(self.action):
@@ -112,18 +110,18 @@ class TaskConfig(Program):
 
 
 class TaskParams(Table):
-    """Times that the levels below need at most, for the promise of a time, and how long they may
-    make no progress.
+    """Time limits of the task level.
 
-    In `[board.<name>.params]`; s of simulated time.
+    Except for `stalled_s` they are the longest times that the levels below need, from which finish
+    times are computed. In `[board.<name>.params]`; s of simulated time.
     """
 
     beginning: Positive = 0.1
-    """from a segment's arrival in the primitive level to motion, s"""
+    """longest time from a segment's arrival at the primitive level to motion, s"""
     settling: Positive = 0.2
-    """from the end of a motion to the report that it is done, s"""
+    """longest time from the end of a motion to the report that it is done, s"""
     gripping: Positive = 0.6
-    """time that the gripper takes to open or close and to settle, s"""
+    """longest time for the gripper to open or close and to settle, s"""
     stalled_s: Positive = 90.0
     """time without any progress after which the task ends, unless an operator holds it; longer than
     the patience of the level below, s"""
@@ -133,7 +131,13 @@ read_program = TaskConfig.read
 
 
 def misfits(action: Action, robot: RobotConfig, scene: SceneConfig) -> Misfits:
-    """Yield key, value and reason of everything that the arm or the scene lacks for an action."""
+    """Yield key, value and reason of every entry of an action that does not suit arm or scene.
+
+    Args:
+        action: The action.
+        robot: The `[robot]` table.
+        scene: The `[scene]` table.
+    """
     if isinstance(action, Transfer):
         if action.object not in scene.objects:
             yield (
@@ -142,11 +146,11 @@ def misfits(action: Action, robot: RobotConfig, scene: SceneConfig) -> Misfits:
                 f"not in the scene; objects: {', '.join(scene.objects) or 'none'}",
             )
         if robot.gripper is None:
-            yield "do", action.do, "the robot has no gripper; permitted: goto, home"
+            yield "do", action.do, "the robot has no gripper; valid actions: goto, home"
     if (
         isinstance(action, Goto)
         and action.joints is not None
         and len(action.joints) != len(robot.joints)
     ):
-        why = f"{len(action.joints)} values; permitted: {len(robot.joints)}, one per joint"
+        why = f"has {len(action.joints)} values but needs {len(robot.joints)}, one per joint"
         yield "joints", list(action.joints), why

@@ -1,5 +1,6 @@
-"""Rehearsal of a program before anything moves: every move is planned as the level below will plan
-it, and timed.
+"""Rehearsal of a program before anything moves.
+
+Every move is planned as the level below will plan it, and timed.
 """
 
 from __future__ import annotations
@@ -15,12 +16,13 @@ from rack.levels.planning.moves import Move, Situation
 from rack.levels.planning.pose import Pose
 from rack.levels.task.program import TaskParams
 
-if TYPE_CHECKING:  # it imports OMPL, which only a planner's process needs
+# This imports OMPL, which only a planner's process needs.
+if TYPE_CHECKING:
     from rack.levels.planning.motion_planner import MotionPlanner
 
 
 class Rehearsed(NamedTuple):
-    """A move and the longest time that its motion takes."""
+    """A move and the longest duration of its motion."""
 
     move: Move
     duration_s: float  # 0 for the gripper
@@ -28,8 +30,9 @@ class Rehearsed(NamedTuple):
 
 @dataclass(frozen=True)
 class Rehearsal:
-    """The result of a sequence of moves. Immutable: `then` returns a new one, so alternatives can
-    start from here.
+    """The state after a sequence of rehearsed moves.
+
+    It is immutable, so that several alternatives can start from the same rehearsal.
     """
 
     motion: MotionPlanner
@@ -46,10 +49,18 @@ class Rehearsal:
         row: int | None = None,
         joints: Array | None = None,
     ) -> Rehearsal:
-        """Return the rehearsal after one more move; `joints` is its goal, or the posture at `tool`.
+        """Return the rehearsal after one more move.
 
-        Without `tool` the move ends at `joints`, or where the tool is. Raises `Refused` when the
-        move cannot be done.
+        Args:
+            action: Number of the action.
+            verb: Kind of the move.
+            tool: Pose of the tool at the end. None if it follows from the joints.
+            row: Row of the object concerned. None if there is none.
+            joints: Joint positions at the end, (joints,), rad, or the posture at `tool`. None to
+                keep the present positions.
+
+        Raises:
+            Refused: The move cannot be done.
         """
         ends_at = self.q if joints is None else joints
         if tool is None:
@@ -70,7 +81,8 @@ class Rehearsal:
                 situation=self.situation.after(move),
                 moves=(*self.moves, Rehearsed(move, 0.0)),
             )
-        # One search is enough: the level below takes the quickest of several, this one among them.
+        # One search is enough. The level below takes the quickest path of several searches, which
+        # include this one.
         path = self.motion.plan(move, self.q, self.situation, searches=1)
         rehearsed = Rehearsed(move, self.motion.paths.duration(path))
         return replace(self, q=path.end, moves=(*self.moves, rehearsed))
@@ -79,33 +91,36 @@ class Rehearsal:
 def finish_times(
     moves: Sequence[Rehearsed], visible_s: float, context: LevelContext, needs: TaskParams
 ) -> list[float]:
-    """Return for every move the latest simulated time, in s, at which the task level reads that it
-    is done.
+    """Return the latest times at which the task level reads that a move is done, s.
 
-    `visible_s` is when the first window of moves becomes visible below. A move begins when the one
-    before it is done, its path is planned, and the window of segments has room for it; each message
-    waits at most one cycle to be read and one to be seen. The result assumes that nothing is in the
-    way.
+    A move begins when the previous move is done, its path is planned, and the window of segments
+    has space for it. Each message waits at most one cycle to be read and one to become visible. The
+    result assumes that nothing blocks the motion.
+
+    Args:
+        moves: The moves.
+        visible_s: Simulated time at which the first window of moves becomes visible below, s.
+        context: The task level.
+        needs: Longest times that the levels below need.
     """
     (pace,) = context.below.values()
-    below = pace.every * context.tick_s
-    done: list[float] = []
-    planned = visible_s
+    below_s = pace.every * context.tick_s
+    done_s: list[float] = []
+    planned_s = visible_s
     for k, (move, duration_s) in enumerate(moves):
-        shown = visible_s
+        shown_s = visible_s
         if k >= WINDOW:
-            shown = max(visible_s, done[k - WINDOW] + 2.0 * below + 2.0 * context.period_s)
+            shown_s = max(visible_s, done_s[k - WINDOW] + 2.0 * below_s + 2.0 * context.period_s)
         if move.is_motion:
-            # The planner makes one plan after the other; only a move that it has waited for costs a
-            # cycle more.
-            planned = max(planned, shown + below) + below * pace.within_cycles
-        at_hand = max(planned, shown) if move.is_motion else shown
-        room = done[k - SEGMENTS] + below if k >= SEGMENTS else 0.0
-        arrives = max(at_hand, room) + 2.0 * below
-        before = done[-1] if done else 0.0
-        begun = max(arrives + needs.beginning, before)
-        lasts_s = duration_s + needs.settling if move.is_motion else needs.gripping
-        end = begun + lasts_s
-        # A move with a time is stretched to end just before it: the next one begins no sooner.
-        done.append(max(end, move.by_s - 2.0 * below))
-    return [time_s + 2.0 * below + context.period_s for time_s in done]
+            # The planner computes one plan after the other. Only a move for which it has waited
+            # takes another cycle.
+            planned_s = max(planned_s, shown_s + below_s) + below_s * pace.within_cycles
+        ready_s = max(planned_s, shown_s) if move.is_motion else shown_s
+        space_s = done_s[k - SEGMENTS] + below_s if k >= SEGMENTS else 0.0
+        arrival_s = max(ready_s, space_s) + 2.0 * below_s
+        previous_s = done_s[-1] if done_s else 0.0
+        begin_s = max(arrival_s + needs.beginning, previous_s)
+        length_s = duration_s + needs.settling if move.is_motion else needs.gripping
+        # A move with a deadline is slowed to end just before it, which delays the next move.
+        done_s.append(max(begin_s + length_s, move.by_s - 2.0 * below_s))
+    return [time_s + 2.0 * below_s + context.period_s for time_s in done_s]

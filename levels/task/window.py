@@ -1,9 +1,8 @@
-"""The moves that the task level shows to the level below: a window on the plan, or an operator's
-goto instead.
+"""The moves that the task level shows to the level below: part of the plan, or an operator's goto.
 
-A goto interrupts the program during a free motion or right after one; that motion is repeated
-afterwards, from the arm's position at that time. Work on an object is completed first: approach,
-grasp, depart.
+A goto interrupts the program during a free motion or right after one. That motion is repeated
+afterwards, from the arm's position at that time. Work on an object (approach, grasp, depart) is
+completed first.
 """
 
 from __future__ import annotations
@@ -27,43 +26,53 @@ from rack.levels.planning.pose import Pose, pointing, pose
 from rack.levels.tables import RobotConfig
 
 JUMP = 2
-"""Step from the newest id shown to the next: a gap makes the level below start anew."""
+"""Step from the newest id shown to the next; a gap makes the level below start over."""
 FIRST_ID = 1
-"""Id of the plan's first move, until an operator has intervened."""
+"""Id of the plan's first move, unless an operator has intervened."""
 FREE = (Verb.MOVE, Verb.MOVE_JOINTS)
-"""Moves that may be interrupted and repeated later from another position."""
+"""Kinds of moves that may be interrupted, and repeated later from another position."""
 MAX_JOINT_RAD = 1e3
-"""Joint goals beyond this are refused; narrower limits are those of the level below."""
+"""Joint goals beyond this are refused. The level below has narrower limits."""
 
 
 class ShownWindow:
-    """Numbers the moves on the bus: ids always rise, even if an operator inserts moves."""
+    """Ids of the moves on the bus.
+
+    They always increase, even if an operator inserts moves.
+    """
 
     def __init__(self, first: int = FIRST_ID, newest: int = 0, before: int = 0) -> None:
-        self.first = first  # id of the plan's first move: its k-th is `first` + k
+        self.first = first  # id of the plan's first move; its move k has the id `first` + k
         self.newest = newest  # newest id shown
-        self.before = before  # the level below has started anew once it has done this id
+        self.before = before  # the level below has started over once it has done this id
 
     def jump(self) -> int:
-        """Return an id with which the level below starts anew."""
+        """Return an id that makes the level below start over."""
         self.newest += JUMP
         self.before = self.newest - 1
         return self.newest
 
     def renumber(self, done: int) -> None:
-        """Show the plan anew from its move `done` on."""
+        """Show the plan under new ids, from its move `done` on."""
         self.first = self.newest + JUMP - done
         self.before = self.first + done - 1
 
     def done(self, below: MoveStatus) -> int:
-        """Return how many of the plan's moves the level below reports done."""
+        """Return how many of the plan's moves the level below reports as done."""
         return below.done - self.first + 1
 
     def breaking_off(self, plan: TaskPlan, done: int, below: MoveStatus) -> tuple[int, bool]:
-        """Return the first move that must not begin so that the plan is broken off, and whether the
-        arm may rest now.
+        """Return the first move that must not begin so that the program can be interrupted.
 
-        It may during a free motion and right after one; else the work on an object comes first.
+        Args:
+            plan: The plan.
+            done: Number of its moves that are done.
+            below: Status of the level below.
+
+        Returns:
+            The number of the move, and True if the arm may come to rest now. This is permitted
+            during a free motion and right after one. Otherwise work on an object is completed
+            first.
         """
         is_begun = below.current == self.first + done
         if not is_free(plan, done) and (is_begun or not is_free(plan, done - 1)):
@@ -71,10 +80,16 @@ class ShownWindow:
         return done, True
 
     def show(self, plan: TaskPlan, done: int, command: TaskCommand, until: int) -> None:
-        """Show the moves from the first one that is not done up to `until`, none before it; after
-        the last, the window stays.
+        """Show the moves from the first one that is not done up to `until`.
 
-        Moves that were done under other ids are not shown again: the level below would repeat them.
+        After the last move the window stays. Moves that were done under other ids are not shown
+        again, because the level below would repeat them.
+
+        Args:
+            plan: The plan.
+            done: Number of its moves that are done.
+            command: Receives the window.
+            until: First move that is not shown.
         """
         first = min(done, max(plan.count - WINDOW, 0)) if self.first == FIRST_ID else done
         count = max(0, min(WINDOW, until - first))
@@ -83,13 +98,14 @@ class ShownWindow:
         self._end(command, count)
 
     def show_one(self, move: Move, command: TaskCommand) -> None:
-        """Show one move alone."""
+        """Show a single move."""
         move.write_to(command.moves[0])
         self._end(command, 1)
 
     def _end(self, command: TaskCommand, count: int) -> None:
+        """Set the count and id of a window, and clear its unused moves."""
         command.count = count
-        # Equal windows have equal bytes.
+        # Unused moves are cleared, so that equal windows have equal bytes.
         command.moves[count:] = np.zeros((), command.moves.dtype)
         if count:
             self.newest = max(self.newest, int(command.moves["id"][count - 1]))
@@ -97,14 +113,15 @@ class ShownWindow:
 
 
 def is_free(plan: TaskPlan, k: int) -> bool:
-    """Return whether move `k` of the plan is a free motion; before the first and after the last
-    move, True.
+    """Return True if move `k` of the plan is a free motion.
+
+    Also True before the first move and after the last.
     """
     return not 0 <= k < plan.count or plan.moves["verb"][k] in FREE
 
 
 class Detour:
-    """An operator's goto: one move instead of the program's, then the rest of the program."""
+    """An operator's goto: a single move that interrupts the program."""
 
     def __init__(
         self, robot: RobotConfig, orders: Orders, window: ShownWindow, move: int = 0
@@ -115,27 +132,26 @@ class Detour:
         self._goal = Goal.NONE
         self._target: tuple[Verb, Pose, Array] | None = None  # kind of move, and its end
         self._is_new = False
-        self.move = move  # id of the goto on the bus; 0: the program is not interrupted
-        self.holds = False  # the arm must rest before the program can be interrupted
-        self.until: int | None = None  # the first move of the program that must not begin
+        self.move = move  # id of the goto on the bus. 0 if the program is not interrupted
+        self.holds = False  # True while the arm must come to rest before the interruption
+        self.until: int | None = None  # first move of the program that must not begin
 
     @property
     def is_known(self) -> bool:
-        """False if this board was restarted and a hold came after the goto: the goal is then
-        lost.
+        """True if the goal is known.
+
+        It is lost if this board was restarted and a hold came after the goto.
         """
         return self._target is not None
 
     def reason(self) -> str:
-        """Return the state of the goto, and the command that ends it."""
+        """Describe the state of the goto, and the command that ends it."""
         goal = described(Operation.GOTO, self._goal)
         stage = "done" if self._orders.answer is Answer.DONE else "under way"
         return f"diverted by the operator: {goal} {stage}; `resume` continues the program"
 
     def begin(self, message: OperatorCommand, is_new: bool) -> None:
-        """Accept a goto, an `OPERATOR_COMMAND`, or refuse it; one that is not new continues under
-        its id.
-        """
+        """Accept or refuse a goto. One that is not new continues under its id."""
         try:
             self._target = self._read(message)
         except ValueError as error:
@@ -145,8 +161,15 @@ class Detour:
         self._is_new = is_new
 
     def step(self, plan: TaskPlan, done: int, below: MoveStatus) -> int:
-        """Advance by one cycle; return how many of the plan's moves are done: `done`, or one
-        less.
+        """Advance by one cycle.
+
+        Args:
+            plan: The plan.
+            done: Number of its moves that are done.
+            below: Status of the level below.
+
+        Returns:
+            How many of the plan's moves are done: `done`, or one less if a move must be repeated.
         """
         self.holds = False
         self.until = None
@@ -164,14 +187,15 @@ class Detour:
         return done
 
     def _leave(self, plan: TaskPlan, done: int, below: MoveStatus) -> int:
-        """Interrupt the program where possible; until then show only the moves that must be done
-        first.
+        """Interrupt the program if possible; until then show only moves that must be done first.
+
+        Returns how many of the plan's moves are done.
         """
         self.until, self.holds = self._window.breaking_off(plan, done, below)
         if not self.holds:
             return done
-        # At rest, the program can be interrupted once the level below has received the window
-        # without further moves.
+        # The program can be interrupted once the arm rests and the level below has received the
+        # window without further moves.
         if below.resting and below.operator >= self._orders.basis:
             self.move = self._window.jump()
             self.holds = False
@@ -179,22 +203,26 @@ class Detour:
         return done
 
     def as_move(self, action: int) -> Move:
-        """Return the goto as a move; `action` is the program's next, though the move serves
-        none.
+        """Return the goto as a move.
+
+        `action` is the program's next action, although the move does not belong to it.
         """
         assert self._target is not None, "there is a move only for a goal"
         verb, tool, joints = self._target
         return Move(self.move, action, verb, None, tool, joints, False, 0.0)
 
     def _follow(self, below: MoveStatus) -> None:
+        """Report that the goto is done or has failed, when the level below reports it."""
         if below.done >= self.move:
             self._orders.done()
         elif below.state == State.ERROR and below.done >= self._window.before:
             self._orders.fail(below.reason)
 
     def _read(self, message: OperatorCommand) -> tuple[Verb, Pose, Array]:
-        """Return the kind of move to a goal, and its end. Raises `ValueError` for an invalid
-        one.
+        """Return the kind of move to the goal, and its tool pose and joint positions.
+
+        Raises:
+            ValueError: The goal is invalid.
         """
         joints = np.array(self._robot.home)
         tool = pose(np.zeros(3), (1.0, 0.0, 0.0, 0.0))

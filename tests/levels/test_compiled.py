@@ -27,7 +27,7 @@ def scaled(value: float) -> float:
 
 
 @pytest.fixture(autouse=True)
-def heard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
+def compiled_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
     """Names of the functions compiled, in a cache of this test's own."""
     names: list[str] = []
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
@@ -39,25 +39,25 @@ def heard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]
     module._say.cache_clear()
 
 
-def called(function: Callable[[float], float] = twice, value: float = 1.5) -> float:
+def call_fresh(function: Callable[[float], float] = twice, value: float = 1.5) -> float:
     """Call a compiled function as a process does that has not used it yet."""
     return compiled(function).load()(value)
 
 
-def kept(tmp_path: Path) -> list[Path]:
+def list_files(tmp_path: Path) -> list[Path]:
     """Return the files, or what is in their places."""
     return sorted((tmp_path / "cache" / "nasrem-rack").glob("*/*"))
 
 
 @pytest.mark.slow
-def test_code_is_compiled_once_for_each_function_and_its_types(
-    heard: list[str], tmp_path: Path
+def test_code_is_compiled_once_per_function_and_types(
+    compiled_names: list[str], tmp_path: Path
 ) -> None:
-    assert [called(), called()] == [3.0, 3.0]
-    assert heard == ["tests.levels.test_compiled.twice"]
-    assert called(value=np.int64(2)) == 4.0
-    assert called(scaled) == 4.5
-    assert len(heard) == len(kept(tmp_path)) == 3
+    assert [call_fresh(), call_fresh()] == [3.0, 3.0]
+    assert compiled_names == ["tests.levels.test_compiled.twice"]
+    assert call_fresh(value=np.int64(2)) == 4.0
+    assert call_fresh(scaled) == 4.5
+    assert len(compiled_names) == len(list_files(tmp_path)) == 3
 
 
 SOURCE = string.Template('''
@@ -76,7 +76,7 @@ def outer(value):
 AS_IT_IS = {"factor": "2.0", "docstring": "Add.", "inner": "value + 1.0", "comment": "Both."}
 
 
-def outer_of(**changes: str) -> compiled[[float], float]:
+def build_outer(**changes: str) -> compiled[[float], float]:
     """Return a function that uses a constant and calls another one, with changes in its source."""
     text = SOURCE.substitute(AS_IT_IS | changes)
     names: dict[str, compiled[[float], float]] = {"compiled": compiled}  # type: ignore[dict-item]
@@ -88,56 +88,56 @@ def outer_of(**changes: str) -> compiled[[float], float]:
 
 
 @pytest.mark.slow
-def test_what_decides_the_code_decides_whether_it_is_compiled(
-    heard: list[str], tmp_path: Path
+def test_code_is_recompiled_only_if_its_source_or_constants_change(
+    compiled_names: list[str], tmp_path: Path
 ) -> None:
-    assert outer_of().load()(1.0) == 4.0
-    assert heard == ["theirs.outer", "theirs.inner"]
-    before = kept(tmp_path)
+    assert build_outer().load()(1.0) == 4.0
+    assert compiled_names == ["theirs.outer", "theirs.inner"]
+    before = list_files(tmp_path)
     for same in ({"docstring": "Sum."}, {"comment": "Twice.\n\n"}):
-        assert outer_of(**same).load()(1.0) == 4.0
-    assert (len(heard), kept(tmp_path)) == (2, before)
-    assert outer_of(inner="value + 2.0").load()(1.0) == 6.0
-    assert heard[2:] == ["theirs.outer", "theirs.inner"]
-    assert outer_of(inner="value + 2.0", factor="3.0").load()(1.0) == 9.0
+        assert build_outer(**same).load()(1.0) == 4.0
+    assert (len(compiled_names), list_files(tmp_path)) == (2, before)
+    assert build_outer(inner="value + 2.0").load()(1.0) == 6.0
+    assert compiled_names[2:] == ["theirs.outer", "theirs.inner"]
+    assert build_outer(inner="value + 2.0", factor="3.0").load()(1.0) == 9.0
     # The called one is the same.
-    assert heard[4:] == ["theirs.outer"]
+    assert compiled_names[4:] == ["theirs.outer"]
     # And none of an earlier state stays.
-    assert len(kept(tmp_path)) == 2
+    assert len(list_files(tmp_path)) == 2
 
 
 @pytest.mark.parametrize("value", ["object()", "[1.0]", "__import__('random')"])
-def test_a_name_whose_value_may_change_unseen_is_refused(value: str) -> None:
-    with pytest.raises(TypeError, match="is no constant of compiled code"):
-        outer_of(factor=value).load()
+def test_a_global_that_may_change_unnoticed_is_refused(value: str) -> None:
+    with pytest.raises(TypeError, match="cannot be a constant in compiled code"):
+        build_outer(factor=value).load()
 
 
-def cut(path: Path) -> None:
+def truncate_file(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-100])
 
 
-def flipped(path: Path) -> None:
+def flip_bit(path: Path) -> None:
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 1
     path.write_bytes(content)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("damage", [cut, flipped])
-def test_damaged_code_is_compiled_again_and_said(
+@pytest.mark.parametrize("damage", [truncate_file, flip_bit])
+def test_damaged_code_is_reported_and_compiled_again(
     damage: Callable[[Path], None],
-    heard: list[str],
+    compiled_names: list[str],
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    called()
-    (file,) = kept(tmp_path)
+    call_fresh()
+    (file,) = list_files(tmp_path)
     damage(file)
-    assert called() == 3.0
-    assert capsys.readouterr().err == f"{file}: damaged; compiled again\n"
-    assert called() == 3.0
-    assert len(heard) == 2
-    assert kept(tmp_path) == [file]
+    assert call_fresh() == 3.0
+    assert capsys.readouterr().err == f"{file} is damaged; the function is compiled again\n"
+    assert call_fresh() == 3.0
+    assert len(compiled_names) == 2
+    assert list_files(tmp_path) == [file]
     assert file.is_file()
 
 
@@ -155,7 +155,7 @@ def test_without_a_home_or_permission_to_read_it_code_is_compiled_in_memory(
             os.environ["HOME"] = str(tmp_path)
         tmp_path.chmod(0o700)
         os.setuid(65_533)
-        return [called(), called()] == [3.0, 3.0]
+        return [call_fresh(), call_fresh()] == [3.0, 3.0]
 
     if os.getuid() != 0:
         pytest.skip("only root can become another user")
@@ -164,15 +164,15 @@ def test_without_a_home_or_permission_to_read_it_code_is_compiled_in_memory(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("place", ["cache", "cache/nasrem-rack"])
-def test_a_cache_that_cannot_be_written_is_said_once_with_its_cure(
-    place: str, heard: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_an_unwritable_cache_is_reported_once_with_a_remedy(
+    place: str, compiled_names: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     # A file in place of a folder: not even root can write into it.
     file = tmp_path / place
     file.parent.mkdir(exist_ok=True)
     file.touch()
-    assert [called(), called(), called(scaled)] == [3.0, 3.0, 4.5]
+    assert [call_fresh(), call_fresh(), call_fresh(scaled)] == [3.0, 3.0, 4.5]
     (line,) = capsys.readouterr().err.splitlines()
-    assert "compiled code cannot be kept, and every launch compiles: " in line
-    assert line.endswith("XDG_CACHE_HOME=FOLDER names one that can be written")
-    assert len(heard) == 3
+    assert "compiled code cannot be saved, so every launch compiles it again: " in line
+    assert line.endswith("set XDG_CACHE_HOME to a folder that can be written")
+    assert len(compiled_names) == 3

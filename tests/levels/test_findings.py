@@ -50,7 +50,7 @@ def test_a_finding_has_the_number_of_its_declaration() -> None:
         ("contact", "N", "finding 'contact' is in N m, not in N"),
     ],
 )
-def test_what_the_class_does_not_declare_is_no_finding(name: str, unit: str, why: str) -> None:
+def test_an_undeclared_finding_is_refused(name: str, unit: str, why: str) -> None:
     with pytest.raises(LevelError, match=f"class Feeler: {why}"):
         Feeler(CONTEXT).raise_finding(name, 1.0, unit=unit)
 
@@ -66,7 +66,7 @@ def test_what_the_class_does_not_declare_is_no_finding(name: str, unit: str, why
         ({"contact": 3}, "attribute 'contact' has the name of a finding"),
     ],
 )
-def test_a_mistaken_declaration_is_an_error_of_the_class(
+def test_an_invalid_declaration_of_a_finding_is_an_error_of_the_class(
     attributes: dict[str, Any], why: str
 ) -> None:
     with pytest.raises(LevelError, match=f"class Mistaken: {why}"):

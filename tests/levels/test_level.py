@@ -70,7 +70,7 @@ def level() -> Answering:
     return made
 
 
-def said(serial: int, setting: str) -> Reading[OperatorCommand]:
+def operator_reading(serial: int, setting: str) -> Reading[OperatorCommand]:
     message = OperatorCommand.zeros({})
     message.id = serial
     message.what = Operation.SET
@@ -88,10 +88,10 @@ def said(serial: int, setting: str) -> Reading[OperatorCommand]:
         ("gian=1.0", "params.gian is not live; live: gain"),
     ],
 )
-def test_a_board_sets_a_live_parameter_within_its_range_alone(
+def test_a_board_sets_a_live_parameter_only_within_its_range(
     level: Answering, setting: str, why: str
 ) -> None:
-    level.input_table("operator")["operator"] = said(1, setting)
+    level.input_table("operator")["operator"] = operator_reading(1, setting)
     level.take_settings(0)
     assert (level.settings.gain, level.settings.offset) == (2.0 if why else 3.5, 0.5)
     status = level.status

@@ -35,7 +35,7 @@ class Answering(AnsweringStatus, version=1):
 RANGES = np.array([[-1.0, 1.0], [0.0, 2.0]])
 
 
-def said(
+def operator_reading(
     serial: int, what: Operation, goal: Goal = Goal.NONE, verdict: Verdict = Verdict.NEW
 ) -> Reading:
     message = OperatorCommand.zeros({})
@@ -52,13 +52,13 @@ def report(orders: Orders, above: int = 0, message: Message | None = None) -> Me
 
 def test_a_command_stays_in_force_until_resume() -> None:
     orders = Orders(TAKES)
-    assert orders.take(said(3, Operation.HOLD))
-    assert not orders.take(said(3, Operation.HOLD, verdict=Verdict.OLD))
+    assert orders.take(operator_reading(3, Operation.HOLD))
+    assert not orders.take(operator_reading(3, Operation.HOLD, verdict=Verdict.OLD))
     assert orders.standing is Operation.HOLD
-    assert orders.take(said(5, Operation.RESUME))
+    assert orders.take(operator_reading(5, Operation.RESUME))
     assert (orders.standing, orders.answer) == (Operation.NONE, Answer.DONE)
     # A command given twice is taken up once.
-    assert not orders.take(said(3, Operation.HOLD))
+    assert not orders.take(operator_reading(3, Operation.HOLD))
     assert orders.standing is Operation.NONE
 
 
@@ -66,13 +66,13 @@ def test_a_command_stays_in_force_until_resume() -> None:
     ("what", "goal"),
     [(Operation.SETPOINT, Goal.JOINTS), (Operation.GOTO, Goal.POSE), (Operation.HOLD, Goal.HOME)],
 )
-def test_a_command_that_the_level_does_not_take_is_refused_and_changes_nothing(
+def test_a_command_that_the_level_does_not_accept_is_refused_and_changes_nothing(
     what: Operation, goal: Goal
 ) -> None:
     orders = Orders(TAKES)
-    orders.take(said(1, Operation.HOLD))
+    orders.take(operator_reading(1, Operation.HOLD))
     report(orders)
-    assert not orders.take(said(2, what, goal))
+    assert not orders.take(operator_reading(2, what, goal))
     shown = report(orders)
     assert (shown.order, shown.answer, shown.standing) == (2, Answer.REFUSED, Operation.HOLD)
     name = f"{what.name} {goal.name}".lower()
@@ -82,15 +82,15 @@ def test_a_command_that_the_level_does_not_take_is_refused_and_changes_nothing(
     )
     # The torque still rests on the one before.
     assert shown.operator == 1
-    unknown = said(3, Operation.NONE)
+    unknown = operator_reading(3, Operation.NONE)
     unknown.message.what = 99
     assert not orders.take(unknown)
     assert report(orders).objection.startswith("99 is not a command of this level")
 
 
-def test_a_command_given_up_holds() -> None:
+def test_the_level_holds_after_an_abandoned_command() -> None:
     orders = Orders(TAKES)
-    orders.take(said(5, Operation.GOTO, Goal.HOME))
+    orders.take(operator_reading(5, Operation.GOTO, Goal.HOME))
     orders.fail("out of reach")
     shown = report(orders)
     assert (shown.standing, shown.answer, shown.objection) == (
@@ -106,23 +106,25 @@ def test_a_command_given_up_holds() -> None:
 SETTING = {**TAKES, Operation.SET: (), Operation.ENABLE: ()}
 
 
-def told(orders: Orders) -> tuple[int, Answer, str]:
+def read_answer(orders: Orders) -> tuple[int, Answer, str]:
     shown = report(orders)
     return shown.order, Answer(shown.answer), shown.objection
 
 
-def test_a_setting_takes_nothing_from_the_answer_to_the_command_in_force() -> None:
+def test_a_setting_does_not_replace_the_answer_to_the_command_in_force() -> None:
     orders = Orders(SETTING)
-    orders.take(said(5, Operation.GOTO, Goal.HOME))
-    assert told(orders) == (5, Answer.TAKEN, "")
-    orders.take(said(6, Operation.SET))
-    assert told(orders) == (6, Answer.DONE, "")
+    orders.take(operator_reading(5, Operation.GOTO, Goal.HOME))
+    assert read_answer(orders) == (5, Answer.TAKEN, "")
+    orders.take(operator_reading(6, Operation.SET))
+    assert read_answer(orders) == (6, Answer.DONE, "")
     # Nor does it make the goto a command that is done.
     assert orders.answer is Answer.TAKEN
     # Nor does one that is refused.
-    orders.take(said(7, Operation.GOTO, Goal.JOINTS), lambda message: orders.refuse("too far"))
+    orders.take(
+        operator_reading(7, Operation.GOTO, Goal.JOINTS), lambda message: orders.refuse("too far")
+    )
     orders.done()
-    assert {told(orders), told(orders)} == {
+    assert {read_answer(orders), read_answer(orders)} == {
         (5, Answer.DONE, ""),
         (7, Answer.REFUSED, "too far"),
     }
@@ -130,26 +132,29 @@ def test_a_setting_takes_nothing_from_the_answer_to_the_command_in_force() -> No
     assert answered(report(orders)) == 6
 
 
-def test_a_goto_that_fails_after_a_setting_fails_under_its_own_serial() -> None:
+def test_a_goto_that_fails_after_a_setting_is_answered_under_its_serial() -> None:
     orders = Orders(SETTING)
-    orders.take(said(5, Operation.GOTO, Goal.HOME))
-    orders.take(said(6, Operation.SET))
+    orders.take(operator_reading(5, Operation.GOTO, Goal.HOME))
+    orders.take(operator_reading(6, Operation.SET))
     orders.fail("out of reach")
     # Both in one cycle: shown one after the other, the newest answer to each.
-    assert told(orders) == (5, Answer.REFUSED, "out of reach")
-    assert told(orders) == (6, Answer.DONE, "")
+    assert read_answer(orders) == (5, Answer.REFUSED, "out of reach")
+    assert read_answer(orders) == (6, Answer.DONE, "")
     assert orders.keeps("task") == "task held, `resume` releases it: out of reach"
 
 
-def test_drives_that_arrive_answer_their_own_command() -> None:
+def test_drives_that_finish_late_answer_the_command_that_started_them() -> None:
     orders = Orders(SETTING)
-    orders.take(said(5, Operation.HOLD))
-    orders.take(said(6, Operation.ENABLE))
-    assert [told(orders), told(orders)] == [(5, Answer.TAKEN, ""), (6, Answer.TAKEN, "")]
+    orders.take(operator_reading(5, Operation.HOLD))
+    orders.take(operator_reading(6, Operation.ENABLE))
+    assert [read_answer(orders), read_answer(orders)] == [
+        (5, Answer.TAKEN, ""),
+        (6, Answer.TAKEN, ""),
+    ]
     orders.done()
-    assert told(orders) == (5, Answer.DONE, "")
+    assert read_answer(orders) == (5, Answer.DONE, "")
     orders.drives_done(6)
-    assert told(orders) == (6, Answer.DONE, "")
+    assert read_answer(orders) == (6, Answer.DONE, "")
 
 
 @pytest.mark.parametrize(
@@ -161,10 +166,10 @@ def test_drives_that_arrive_answer_their_own_command() -> None:
         ((np.nan, 1.0), "joint 'base' at nan rad; permitted: -1 to 1"),
     ],
 )
-def test_joints_that_cannot_be_name_the_joint_and_its_range(
+def test_an_invalid_joint_goal_names_the_joint_and_its_range(
     joints: tuple[float, ...], why: str
 ) -> None:
-    message = said(1, Operation.GOTO, Goal.JOINTS).message
+    message = operator_reading(1, Operation.GOTO, Goal.JOINTS).message
     message.count = len(joints)
     message.joints[: len(joints)] = joints
     if why:
@@ -187,7 +192,7 @@ def is_under_way(rack: WholeRack) -> bool:
     return bool(np.abs(rack.read("servo.status").target_velocity).max() > 0.1)
 
 
-def touring(actions: Sequence[Mapping[str, Any]] = TOUR) -> tuple[WholeRack, Operator]:
+def start_tour(actions: Sequence[Mapping[str, Any]] = TOUR) -> tuple[WholeRack, Operator]:
     """Return a rack whose arm is under way, and its operator."""
     rack = WholeRack(actions=actions)
     operator = Operator(rack)
@@ -195,7 +200,7 @@ def touring(actions: Sequence[Mapping[str, Any]] = TOUR) -> tuple[WholeRack, Ope
     return rack, operator
 
 
-def answers(level: str, answer: Answer, serial: int) -> Callable[[WholeRack], bool]:
+def has_answer(level: str, answer: Answer, serial: int) -> Callable[[WholeRack], bool]:
     def is_it(rack: WholeRack) -> bool:
         found = rack.read(f"{level}.status")
         return found.order == serial and found.answer == answer
@@ -206,9 +211,9 @@ def answers(level: str, answer: Answer, serial: int) -> Callable[[WholeRack], bo
 @pytest.mark.slow
 @pytest.mark.parametrize("level", LEVELS)
 def test_a_level_held_in_motion_finishes_the_task_after_resume(level: str) -> None:
-    rack, operator = touring([REACH, HOME])
+    rack, operator = start_tour([REACH, HOME])
     serial = operator.say(level, Operation.HOLD)
-    assert rack.run(6.0, answers(level, Answer.DONE, serial))
+    assert rack.run(6.0, has_answer(level, Answer.DONE, serial))
     held = rack.read("servo.status").position.copy()
     if level != "servo":  # a restarted board holds on
         rack.lose(level, 200)
@@ -232,13 +237,13 @@ def test_a_level_held_in_motion_finishes_the_task_after_resume(level: str) -> No
 
 
 def test_gotos_leave_a_free_motion_and_the_program_continues_afterwards() -> None:
-    rack, operator = touring()
+    rack, operator = start_tour()
     serial = operator.goto("task", ASIDE, DOWN)
     assert rack.run(20.0, lambda r: r.read("task.status").detour > 0)
     # It goes on after the task board has died.
     move = rack.task.detour
     rack.lose("task", 200)
-    assert rack.run(20.0, answers("task", Answer.DONE, serial))
+    assert rack.run(20.0, has_answer("task", Answer.DONE, serial))
     assert rack.task.detour == move
     scene = rack.read("servo.scene")
     assert np.abs(scene.tool_position - ASIDE).max() < 5e-3
@@ -250,15 +255,15 @@ def test_gotos_leave_a_free_motion_and_the_program_continues_afterwards() -> Non
     rack.run(2.0)
     assert np.abs(rack.read("servo.scene").tool_position - ASIDE).max() < 5e-3
     serial = operator.goto("task", [3.0, 0.0, 0.5], DOWN)
-    assert rack.run(20.0, answers("task", Answer.REFUSED, serial))
+    assert rack.run(20.0, has_answer("task", Answer.REFUSED, serial))
     assert "cannot bring the tool to" in rack.task.objection
     assert (rack.task.standing, rack.task.state) == (Operation.HOLD, State.HOLDING)
     # The next one may come while one is under way.
     first = operator.goto("task", [0.5, 0.35, 0.90], DOWN)
-    assert rack.run(20.0, answers("task", Answer.TAKEN, first))
+    assert rack.run(20.0, has_answer("task", Answer.TAKEN, first))
     rack.run(0.3)
     second = operator.say("task", Operation.GOTO, goal=Goal.HOME)
-    assert rack.run(20.0, answers("task", Answer.DONE, second))
+    assert rack.run(20.0, has_answer("task", Answer.DONE, second))
     operator.say("task", Operation.RESUME)
     assert rack.run_to_end(40.0).state == State.DONE
     assert (rack.task.detour, rack.task.moves_done) == (0, rack.task.moves)

@@ -47,7 +47,7 @@ def check(rack: WholeRack) -> None:
 
 
 @pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.thorough)])
-def test_task_is_done_whichever_tasks_are_lost_whenever_and_for_however_long(seed: int) -> None:
+def test_the_task_is_done_in_spite_of_any_lost_boards(seed: int) -> None:
     chance = np.random.default_rng(seed)
     rack = WholeRack(actions=[TRANSFER])
     for _ in range(8):
@@ -60,7 +60,7 @@ def test_task_is_done_whichever_tasks_are_lost_whenever_and_for_however_long(see
     check(rack)
 
 
-def disturbance(chance: np.random.Generator, every: int) -> Disturbance:
+def draw_disturbance(chance: np.random.Generator, every: int) -> Disturbance:
     """Draw a fault of a writer that writes every so many ticks."""
     seed = int(chance.integers(1 << 30))
     kinds = (
@@ -72,13 +72,13 @@ def disturbance(chance: np.random.Generator, every: int) -> Disturbance:
     return kinds[int(chance.integers(len(kinds)))]
 
 
-def test_task_is_done_whatever_is_muted_dropped_held_back_or_out_of_order() -> None:
+def test_the_task_is_done_in_spite_of_lost_delayed_or_reordered_messages() -> None:
     chance = np.random.default_rng(3)
     rack = WholeRack(actions=[TRANSFER])
     for mailbox in chance.permutation(MAILBOXES):
         every = rack.tasks[mailbox.partition(".")[0]].spec.every
         fault, ticks = (
-            disturbance(chance, every),
+            draw_disturbance(chance, every),
             max(int(chance.uniform(1.0, 2.0) * SECOND), 4 * every),
         )
         at = int(chance.integers(NOMINAL))
@@ -88,7 +88,7 @@ def test_task_is_done_whatever_is_muted_dropped_held_back_or_out_of_order() -> N
     check(rack)
 
 
-def test_object_stays_in_the_gripper_while_everything_that_holds_it_is_lost() -> None:
+def test_the_object_stays_in_the_gripper_while_all_boards_that_hold_it_are_lost() -> None:
     rack = WholeRack(actions=[TRANSFER])
     assert rack.run(
         15.0,

@@ -46,7 +46,7 @@ def test_a_class_has_the_ports_of_its_bases_then_its_own() -> None:
     assert (Derived.last.queued, Base.below.many, Base.below.optional) == (True, True, True)
 
 
-def test_a_level_without_a_board_has_empty_readings_and_messages_of_its_own() -> None:
+def test_a_level_without_a_board_has_empty_readings_and_messages() -> None:
     level = Base(CONTEXT)
     assert (level.above.verdict, level.above.message.value, level.below) == (Verdict.NONE, 0, {})
     number = Number.zeros({})
@@ -61,7 +61,7 @@ def test_a_level_without_a_board_has_empty_readings_and_messages_of_its_own() ->
     ("body", "why"),
     [
         ({"context": Input(Number, "a.b")}, ""),
-        ({"inputs": {"a": Input(Number, "a.b")}}, "'inputs' is not a dict any more"),
+        ({"inputs": {"a": Input(Number, "a.b")}}, "'inputs' is no longer a dict"),
         ({"process": Input(Number, "a.b")}, "port 'process' has the name of another attribute"),
         ({"params": Output(Number)}, "port 'params' has the name of another attribute"),
         ({"above": 3}, "attribute 'above' has the name of a port"),
@@ -81,7 +81,7 @@ def test_a_port_with_the_name_of_another_attribute_is_an_error_of_the_class(
         type("Bad", (Base,), body)
 
 
-def test_what_a_config_makes_is_apart_from_attributes() -> None:
+def test_ports_from_a_config_are_separate_from_attributes() -> None:
     level = Base(CONTEXT)
     level.input_table("context")["context"] = 1
     level.place_output("process", 2)
@@ -89,7 +89,7 @@ def test_what_a_config_makes_is_apart_from_attributes() -> None:
     assert level.context is CONTEXT
 
 
-def test_nothing_is_sent_by_a_level_that_no_board_has_connected() -> None:
+def test_an_unconnected_level_cannot_send() -> None:
     class Sending(Base):
         letters = QueuedOutput(Number)
 

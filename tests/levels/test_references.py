@@ -17,7 +17,7 @@ from tests.processes import BOUND_S, FORKS, children_of, descriptors
 SYSTEMS = ("fig2", "nist-state-table", "rccl", "hic", "penn", "chimera", "cell/puma", "cell")
 
 
-def as_saved_before(config: RackConfig) -> tuple[RackConfig, list[str]]:
+def use_old_names(config: RackConfig) -> tuple[RackConfig, list[str]]:
     """Return a config as a run of an earlier version saved it, and the old names in it."""
     text, used = config.text(), []
     for old, new in MOVED.items():
@@ -30,13 +30,13 @@ def as_saved_before(config: RackConfig) -> tuple[RackConfig, list[str]]:
     return loads(text), used
 
 
-def test_each_old_name_leads_to_what_is_there() -> None:
+def test_each_old_reference_resolves_to_an_existing_object() -> None:
     for old in MOVED:
         module, name = module_and_name(old if ":" in old else f"{old}:")
         assert not name or hasattr(module, name), old
 
 
-def test_names_that_only_begin_like_a_moved_one_stay() -> None:
+def test_references_that_only_start_like_a_moved_one_are_unchanged() -> None:
     assert current("rack.levels.handle:Grip") == "rack.levels.handle:Grip"
     assert current("rack.levels.servo:ServoExecutor") == "rack.levels.servo:ServoExecutor"
     assert (
@@ -47,9 +47,9 @@ def test_names_that_only_begin_like_a_moved_one_stay() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SYSTEMS)
-def test_a_config_saved_before_is_wired_as_today(name: str) -> None:
+def test_a_config_of_an_earlier_version_is_wired_like_a_present_one(name: str) -> None:
     config = load(CONFIGS / f"{name}.toml" if "/" in name else name)
-    saved, used = as_saved_before(config)
+    saved, used = use_old_names(config)
     assert used
     assert wire(saved) == wire(config)
 
@@ -64,14 +64,14 @@ ENDING = {
     "interrupts": ("raise KeyboardInterrupt", "ImportError: it ended the process: exit status 1"),
     "exits": ("raise SystemExit(7)", "SystemExit: 7"),
     "raises": ("1 / 0", "ZeroDivisionError: division by zero"),
-    "loops": ("while True: pass", "ImportError: not done within 0.5 s"),
+    "loops": ("while True: pass", "ImportError: it did not finish within 0.5 s"),
 }
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings(FORKS)
 @pytest.mark.parametrize("name", ENDING)
-def test_a_module_neither_ends_nor_holds_the_process_that_checks_a_config(
+def test_a_module_cannot_end_or_block_the_process_that_checks_a_config(
     name: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -91,11 +91,11 @@ def test_a_module_neither_ends_nor_holds_the_process_that_checks_a_config(
     assert children_of(os.getpid()) == children
     assert descriptors() == before
     # Once, though a config is checked for many mistakes.
-    said = "importing 'it_loops', for at most 0.5 s\n" if name == "loops" else ""
+    said = "still importing 'it_loops'; it may take 0.5 s\n" if name == "loops" else ""
     assert capfd.readouterr() == ("", said)
 
 
-def test_what_a_module_prints_is_printed_once(tmp_path: Path) -> None:
+def test_output_of_an_imported_module_is_printed_once(tmp_path: Path) -> None:
     (tmp_path / "it_prints.py").write_text("print('here')")
     lines = [
         "import rack.levels.references as references",

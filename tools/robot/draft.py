@@ -249,7 +249,7 @@ def _add_gripper(made: Draft) -> None:
         made.table["gripper"] = config
         cell = made.cell()
         # Where home is, is not known yet: the fingers settle as if they were alone.
-        alone = np.isin(np.arange(cell.model.ngeom), cell.gripper_geoms)
+        alone = np.isin(np.arange(cell.model.ngeom), cell.geoms.gripper)
         cell.model.geom_contype *= alone
         cell.model.geom_conaffinity *= alone
         check_fingers(cell, config)
@@ -299,7 +299,7 @@ def touching(
     model = cell.model
     data.qpos[cell.qpos] = q
     mujoco.mj_fwdPosition(model, data)
-    bodies = model.geom_bodyid[unintended_contacts(data, cell.touch, skin_m)]
+    bodies = model.geom_bodyid[unintended_contacts(data, cell.geoms.touch, skin_m)]
     names = [sorted(str(model.body(body).name) for body in pair) for pair in bodies]
     return {(first, second) for first, second in names}
 

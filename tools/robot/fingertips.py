@@ -101,7 +101,7 @@ class _Fingers:
         self._gripper = cell.gripper
         self.data = cell.start()
         solid = (model.geom_contype | model.geom_conaffinity) != 0
-        self.geoms = cell.gripper_geoms[solid[cell.gripper_geoms]]
+        self.geoms = cell.geoms.gripper[solid[cell.geoms.gripper]]
         closed = self.close(1.0)
         ways = self.close(NEARLY) - closed
         moving = np.linalg.norm(ways, axis=1) > LEAST_WAY_M

@@ -35,7 +35,7 @@ def cut_meshes(spec: mujoco.MjSpec, cell: Cell, out: Array) -> int:
     for geom, number in [(geom, geom.id) for geom in spec.geoms]:
         is_solid = geom.contype or geom.conaffinity
         is_mesh = geom.type == mujoco.mjtGeom.mjGEOM_MESH
-        if not (is_solid and is_mesh and number in cell.gripper_geoms):
+        if not (is_solid and is_mesh and number in cell.geoms.gripper):
             continue
         own = data.xmat[cell.model.geom_bodyid[number]].reshape(3, 3)
         corners, faces = _surface(cell.model, data, number)

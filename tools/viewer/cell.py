@@ -235,7 +235,7 @@ def extent_of(cell: Cell) -> tuple[Array, float]:
     data = cell.start()
     model = cell.model
     geoms = np.union1d(
-        cell.arm_geoms, np.flatnonzero(np.isin(model.geom_bodyid, cell.bodies))
+        cell.geoms.arm, np.flatnonzero(np.isin(model.geom_bodyid, cell.bodies))
     ).astype(int)
     if not len(geoms):
         return model.stat.center, float(model.stat.extent)

@@ -208,7 +208,7 @@ class GraspPlanner:
         data = self._data
         data.qpos[self._cell.qpos] = position
         mujoco.mj_fwdPosition(model, data)
-        hand = np.isin(data.contact.geom, self._cell.gripper_geoms).any(axis=1)
+        hand = np.isin(data.contact.geom, self._cell.geoms.gripper).any(axis=1)
         return bool((hand & (data.contact.dist < 0.0)).any())
 
     def _find_grip_force(self, row: int) -> float:

@@ -89,7 +89,7 @@ def test_unknown_fields_and_ports_of_levels_are_named(
     with pytest.raises(AttributeError, match="message 'number' has no field 'speed'; fields: id, "):
         program.numbers.message.speed = 1.0  # type: ignore[attr-defined]
     assert program.sum.read().message.state is State.IDLE
-    with pytest.raises(LevelError, match="'sum' is a level's Input; permitted: ProgramInput, "):
+    with pytest.raises(LevelError, match="'sum' is a level's Input; it must be a ProgramInput or "):
 
         class _OfALevel(HostProgram):
             sum = Input(Sum, "below.sum")

@@ -19,7 +19,9 @@ from rack.levels.robot.dynamics import Dynamics
 from tests.levels.arms import CLOCK_NS, cell, config
 
 
-def moving(name: str = "puma560", every: int = 1) -> tuple[SimulatedArm, Cell, Callable[[], Array]]:
+def build_moving_arm(
+    name: str = "puma560", every: int = 1
+) -> tuple[SimulatedArm, Cell, Callable[[], Array]]:
     """Return an arm under way, and torques that would keep it under way."""
     made = cell(name)
     made.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
@@ -39,8 +41,8 @@ def moving(name: str = "puma560", every: int = 1) -> tuple[SimulatedArm, Cell, C
 
 
 @pytest.mark.parametrize("every", [1, 3])
-def test_the_brakes_close_after_two_torque_cycles_without_a_command(every: int) -> None:
-    arm, _, torque = moving(every=every)
+def test_the_brakes_engage_after_two_torque_cycles_without_a_command(every: int) -> None:
+    arm, _, torque = build_moving_arm(every=every)
     arm.drive(torque(), 0.0)
     arm.step(2 * every)
     assert not arm.braked
@@ -50,8 +52,8 @@ def test_the_brakes_close_after_two_torque_cycles_without_a_command(every: int) 
 
 
 @pytest.mark.slow
-def test_closed_brakes_stop_and_hold_an_arm_all_of_whose_motors_are_off() -> None:
-    arm, _, torque = moving()
+def test_engaged_brakes_stop_and_hold_an_arm_with_all_motors_off() -> None:
+    arm, _, torque = build_moving_arm()
     arm.weaken(np.zeros(6))
     arm.brake()
     arm.step(600)
@@ -67,7 +69,7 @@ def test_closed_brakes_stop_and_hold_an_arm_all_of_whose_motors_are_off() -> Non
 
 
 def test_an_arm_restored_with_engaged_brakes_continues_bit_for_bit() -> None:
-    arm, made, _ = moving()
+    arm, made, _ = build_moving_arm()
     arm.brake()
     arm.step(30)
     arm.brake()
@@ -90,10 +92,8 @@ def test_an_arm_restored_with_engaged_brakes_continues_bit_for_bit() -> None:
     ("value", "alarm"),
     [(np.nan, Alarm.COMMAND_INVALID), (np.inf, Alarm.COMMAND_INVALID), (1e3, Alarm.COMMAND_LIMIT)],
 )
-def test_a_torque_that_no_servo_level_gives_closes_the_brakes_and_is_named(
-    value: float, alarm: Alarm
-) -> None:
-    arm, made, torque = moving()
+def test_an_invalid_torque_engages_the_brakes_and_is_reported(value: float, alarm: Alarm) -> None:
+    arm, made, torque = build_moving_arm()
     command = torque()
     command[3] = -value
     found = arm.drive(command, 0.0)
@@ -107,7 +107,7 @@ def test_a_torque_that_no_servo_level_gives_closes_the_brakes_and_is_named(
 
 
 def test_the_limit_monitor_counts_every_step_beyond_a_limit_and_names_the_first() -> None:
-    arm, made, torque = moving()
+    arm, made, torque = build_moving_arm()
     arm._data.qvel[made.dof[1]] = 3.0
     arm.drive(torque(), 0.0)
     arm.step(1)

@@ -26,7 +26,7 @@ RNG = np.random.default_rng(8)
 OFFSET = np.array([0.02, -0.03, 0.05])
 
 
-def driven(arm: SimulatedArm, made: Cell, ticks: int) -> Message:
+def drive_cycles(arm: SimulatedArm, made: Cell, ticks: int) -> Message:
     """Drive an arm as a controller does; return its state."""
     for tick in range(ticks):
         sensed = arm.sense()
@@ -44,7 +44,7 @@ def scene(arm: SimulatedArm, made: Cell) -> Message:
     return seen
 
 
-def in_python(arm: SimulatedArm) -> None:
+def use_python(arm: SimulatedArm) -> None:
     """Replace an arm's compiled functions by their Python."""
     arm._advance, arm._copy_state = substeps.advance, substeps.copy_state
     arm._gate._is_clear = drives.is_clear
@@ -56,8 +56,8 @@ def in_python(arm: SimulatedArm) -> None:
 def test_an_arm_moves_bit_for_bit_as_in_python(name: str) -> None:
     made = cell(name)
     one, other = (SimulatedArm(made, config(name)[1], CLOCK_NS) for _ in range(2))
-    in_python(other)
-    assert driven(one, made, 300).raw == driven(other, made, 300).raw
+    use_python(other)
+    assert drive_cycles(one, made, 300).raw == drive_cycles(other, made, 300).raw
     assert one.touches == other.touches
     assert scene(one, made).raw == scene(other, made).raw
 
@@ -89,7 +89,7 @@ def test_solutions_and_coarse_samples_are_the_same_as_in_python() -> None:
         assert np.array_equal(one, other)
 
 
-def samples(tick: int) -> Array:
+def draw_samples(tick: int) -> Array:
     """Return the noise of a tick in standard deviations, (2, joints)."""
     encoders = Encoders(np.zeros(6), np.full(6, 1e-3))
     return sensors.CoarseSensors(encoders, 5).sample(np.zeros(6), np.zeros(6), tick) / [
@@ -107,12 +107,12 @@ def test_preloading_leaves_nothing_to_be_compiled_in_a_cycle(tmp_path: Path) -> 
     ):
         arm = SimulatedArm(made, surroundings, CLOCK_NS)
         arm.dynamics.terms(made.home, np.zeros(6), Payload(1.0, OFFSET))
-        driven(arm, made, 3)
+        drive_cycles(arm, made, 3)
         arm.drive(made.bounds.torque, 0.0)
         arm.brake()
         arm.step(2)
         scene(arm, made)
-    samples(1)
+    draw_samples(1)
     functions: list[compiled[..., Any]] = [
         *(dynamics.evaluate, dynamics.carry, substeps.advance, substeps.copy_state),
         *(drives.is_clear, sensors.sense_coarsely),

@@ -16,7 +16,7 @@ from rack.levels.robot.dynamics import Dynamics
 from tests.levels.arms import CLOCK_NS, cell, config
 
 
-def linked(*faults: Fault) -> tuple[FaultyLink, SimulatedArm, dict[int, bool]]:
+def build_link(*faults: Fault) -> tuple[FaultyLink, SimulatedArm, dict[int, bool]]:
     made, acted = cell("puma560"), dict[int, bool]()
     arm = SimulatedArm(made, config("puma560")[1], CLOCK_NS)
     link = FaultyLink(arm, acted)
@@ -24,30 +24,32 @@ def linked(*faults: Fault) -> tuple[FaultyLink, SimulatedArm, dict[int, bool]]:
     return link, arm, acted
 
 
-def fault(kind: str, seed: int = 7, **parameters: float) -> Fault:
+def build_fault(kind: str, seed: int = 7, **parameters: float) -> Fault:
     return Fault(kind, parameters, seed, 0, KINDS[kind].step)
 
 
 HOLDING = Dynamics(cell("puma560")).terms(cell("puma560").home, np.zeros(6)).bias.copy()
 
 
-def test_a_fault_of_a_sensor_is_on_its_joint_alone() -> None:
-    link, arm, acted = linked(fault("sensor-bias", size=0.3, joint=2))
+def test_a_sensor_fault_affects_only_its_joint() -> None:
+    link, arm, acted = build_link(build_fault("sensor-bias", size=0.3, joint=2))
     assert link.sense().position - arm.sense().position == pytest.approx([0, 0, 0.3, 0, 0, 0])
     assert acted == {0: True}
     # An arm may lack the joint.
-    link, arm, acted = linked(fault("sensor-nan", joint=9), fault("actuator-off", joint=9))
+    link, arm, acted = build_link(
+        build_fault("sensor-nan", joint=9), build_fault("actuator-off", joint=9)
+    )
     assert np.array_equal(link.sense().position, arm.sense().position)
     link.drive(HOLDING, 0.0)
     assert acted == {}
-    link, _, _ = linked(fault("sensor-nan", joint=-1))
+    link, _, _ = build_link(build_fault("sensor-nan", joint=-1))
     sample = link.sense()
     assert np.isnan(sample.position).all()
     assert np.isfinite(sample.velocity).all()
 
 
-def test_a_stuck_sensor_acts_once_it_differs_from_the_truth_and_shows_once_by_enough() -> None:
-    link, arm, acted = linked(fault("sensor-stuck", joint=0))
+def test_a_stuck_sensor_acts_when_wrong_and_must_be_detected_when_far_off() -> None:
+    link, arm, acted = build_link(build_fault("sensor-stuck", joint=0))
     first = link.sense().position.copy()
     assert acted == {}
     shows = []
@@ -64,8 +66,8 @@ def test_a_stuck_sensor_acts_once_it_differs_from_the_truth_and_shows_once_by_en
     assert 0 < sum(shows) < len(shows) == 20
 
 
-def test_a_motor_that_is_off_gives_nothing_and_the_others_give_their_command() -> None:
-    link, arm, acted = linked(fault("actuator-off", joint=1))
+def test_a_motor_that_is_off_gives_no_torque_and_the_others_follow_their_command() -> None:
+    link, arm, acted = build_link(build_fault("actuator-off", joint=1))
     link.drive(HOLDING, 0.0)
     given = arm._data.ctrl[arm.cell.actuators]
     assert given[1] == 0.0
@@ -77,10 +79,8 @@ def test_a_motor_that_is_off_gives_nothing_and_the_others_give_their_command() -
     assert arm._data.ctrl[arm.cell.actuators][1] == HOLDING[1]
 
 
-def test_a_saturated_motor_gives_its_part_and_a_motor_that_is_asked_for_less_is_not_at_fault() -> (
-    None
-):
-    link, arm, acted = linked(fault("actuator-saturated", part=0.1, joint=-1))
+def test_a_saturated_motor_is_limited_and_acts_only_beyond_its_limit() -> None:
+    link, arm, acted = build_link(build_fault("actuator-saturated", part=0.1, joint=-1))
     link.drive(HOLDING, 0.0)
     limits = arm.cell.bounds.torque
     assert (np.abs(arm._data.ctrl[arm.cell.actuators]) <= 0.1 * limits + 1e-12).all()
@@ -89,11 +89,11 @@ def test_a_saturated_motor_gives_its_part_and_a_motor_that_is_asked_for_less_is_
     assert acted == {}
 
 
-def test_faults_on_one_arm_add_up_and_each_says_that_it_acts() -> None:
-    link, arm, acted = linked(
-        fault("sensor-bias", size=0.1, joint=0),
-        fault("command-nan", joint=0),
-        fault("sensor-bias", size=0.2, joint=0),
+def test_faults_on_one_arm_combine_and_each_is_recorded() -> None:
+    link, arm, acted = build_link(
+        build_fault("sensor-bias", size=0.1, joint=0),
+        build_fault("command-nan", joint=0),
+        build_fault("sensor-bias", size=0.2, joint=0),
     )
     assert (link.sense().position - arm.sense().position)[0] == pytest.approx(0.3)
     link.drive(HOLDING, 0.0)
@@ -105,7 +105,7 @@ def test_faults_on_one_arm_add_up_and_each_says_that_it_acts() -> None:
     ("blocks", "more", "shows"),
     [(0, 0.0, True), (1, 0.0, False), (1, 20.0, True), (2, 20.0, False)],
 )
-def test_a_motor_that_is_off_acts_at_once_and_shows_later_where_a_resting_arm_bears_a_load(
+def test_a_motor_that_is_off_is_detectable_later_if_a_resting_arm_carries_a_load(
     blocks: int, more: float, shows: bool, says_held: bool
 ) -> None:
     made, acted = cell("puma560"), dict[int, bool]()
@@ -113,7 +113,7 @@ def test_a_motor_that_is_off_acts_at_once_and_shows_later_where_a_resting_arm_be
     lay_against_a_finger(made, arm, blocks)
     assert (arm.holds, arm.leans) == (blocks > 0, blocks > 1)
     link = FaultyLink(arm, acted, holds=lambda: says_held)
-    link.inject([fault("actuator-off", joint=1)])
+    link.inject([build_fault("actuator-off", joint=1)])
     link.drive(HOLDING + np.array([0.0, more, 0.0, 0.0, 0.0, 0.0]), 0.0)
     # Its level may take a part for held that the arm does not hold.
     assert acted == {0: shows and (blocks > 0 or not says_held)}
@@ -126,7 +126,7 @@ def lay_against_a_finger(made: Cell, arm: SimulatedArm, blocks: int) -> None:
     mujoco.mj_forward(made.model, data)
     finger = next(
         int(geom)
-        for geom in made.gripper_geoms
+        for geom in made.geoms.gripper
         if made.model.geom(int(geom)).name.startswith("pad")
     )
     place = data.geom_xpos[finger].copy()

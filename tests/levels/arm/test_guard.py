@@ -53,7 +53,7 @@ class CoarseArm(IdealArm):
         )
 
 
-def driven(link: Arm | GuardedArm, arm: Arm, torques: Iterator[Array]) -> tuple[Array, Array]:
+def drive_cycles(link: Arm | GuardedArm, arm: Arm, torques: Iterator[Array]) -> tuple[Array, Array]:
     """Drive an arm cycle by cycle; return the positions, and the velocities, that it had."""
     arm.enable()
     true = []
@@ -68,7 +68,7 @@ def driven(link: Arm | GuardedArm, arm: Arm, torques: Iterator[Array]) -> tuple[
     return positions, velocities
 
 
-def excess(cell: Cell, motion: tuple[Array, Array]) -> tuple[float, float]:
+def compute_excess(cell: Cell, motion: tuple[Array, Array]) -> tuple[float, float]:
     """Return by how much the positions and the velocities of a motion are beyond the limits."""
     positions, velocities = motion
     low, high = cell.bounds.position.T
@@ -87,20 +87,20 @@ def random_torques(cell: Cell, seed: int, cycles: int) -> Iterator[Array]:
 
 
 @pytest.mark.slow
-def test_as_coarse_as_its_encoders_may_be_it_keeps_them_too(tmp_path: Path) -> None:
+def test_an_arm_with_the_coarsest_permitted_encoders_keeps_its_limits(tmp_path: Path) -> None:
     robot = pendulum(tmp_path)
     sensors = SensorConfig(resolution=2e-3, noise=3e-4)
     cell = build_cell(robot.model_copy(update={"sensors": sensors}), SceneConfig(), CLOCK_NS)
     assert cell.encoders.off.min() > 2e-3
     arm = CoarseArm(cell, SceneConfig(), CLOCK_NS)
     guard = GuardedArm(arm, TICK_S)
-    assert max(excess(cell, driven(guard, arm, random_torques(cell, 0, 800)))) <= 0.0
+    assert max(compute_excess(cell, drive_cycles(guard, arm, random_torques(cell, 0, 800)))) <= 0.0
     assert arm.clipped > 50
     assert arm.violations == 0
 
 
 @pytest.mark.slow
-def test_missed_cycles_lead_beyond_no_limit_either(tmp_path: Path) -> None:
+def test_missed_cycles_do_not_lead_beyond_a_limit(tmp_path: Path) -> None:
     robot = pendulum(tmp_path)
     cell = build_cell(robot, SceneConfig(), CLOCK_NS)
     random = np.random.default_rng(0)
@@ -117,7 +117,7 @@ def test_missed_cycles_lead_beyond_no_limit_either(tmp_path: Path) -> None:
             for _ in range(random.integers(1, arm.patience, endpoint=True)):
                 arm.step(1)
                 motion = (arm._q[None], arm._qd[None])
-                worst = max(worst, *excess(cell, motion))
+                worst = max(worst, *compute_excess(cell, motion))
         assert arm.violations == 0
         return float(worst)
 
@@ -126,7 +126,7 @@ def test_missed_cycles_lead_beyond_no_limit_either(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("sample", [(np.nan, 0.0), (0.0, np.nan), (np.inf, 0.0)])
-def test_nothing_is_driven_on_a_sample_that_is_not_finite(
+def test_an_arm_is_not_driven_on_a_sample_that_is_not_finite(
     tmp_path: Path, sample: tuple[float, float]
 ) -> None:
     robot = pendulum(tmp_path)
@@ -170,7 +170,7 @@ class LyingArm(IdealArm):
 
 
 @pytest.mark.parametrize("lie", ["sticks", "stalls", "jumps", "drifts", "claims"])
-def test_an_arm_whose_samples_lie_in_full_motion_is_braked_within_its_limits(
+def test_an_arm_whose_samples_become_wrong_in_full_motion_is_braked_within_its_limits(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lie: str
 ) -> None:
     monkeypatch.setattr(LyingArm, "lie", lie)
@@ -183,7 +183,7 @@ def test_an_arm_whose_samples_lie_in_full_motion_is_braked_within_its_limits(
     worst, braked_at = -np.inf, 0
     for tick in range(400):
         servo.run(1, course.at)
-        worst = max(worst, *excess(arm.cell, (arm._q[None], arm._qd[None])))
+        worst = max(worst, *compute_excess(arm.cell, (arm._q[None], arm._qd[None])))
         if arm.braked and tick > 150 and not braked_at:
             braked_at = tick
     assert worst <= 0.0
@@ -199,7 +199,7 @@ def rig(folder: Path, jumps: dict[int, tuple[float, float]]) -> ServoRig:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("jump", "what"), [((9.0, 0.0), "position"), ((0.0, 99.0), "velocity")])
-def test_a_sample_beyond_a_limit_is_said_counted_and_brakes(
+def test_a_sample_beyond_a_limit_is_reported_and_counted_and_engages_the_brakes(
     tmp_path: Path, jump: tuple[float, float], what: str
 ) -> None:
     servo = rig(tmp_path, dict.fromkeys(range(100, 103), jump))
@@ -223,18 +223,18 @@ def test_a_sample_beyond_a_limit_is_said_counted_and_brakes(
 
 
 @pytest.mark.slow
-def test_during_bring_up_no_torques_lead_beyond_its_part_of_the_speed(tmp_path: Path) -> None:
+def test_during_bring_up_torques_keep_the_reduced_speed(tmp_path: Path) -> None:
     robot = pendulum(tmp_path)
     cell = build_cell(robot, SceneConfig(), CLOCK_NS)
     arm = IdealArm(cell, SceneConfig(), CLOCK_NS)
-    guard = GuardedArm(arm, TICK_S, part=0.1)
-    _, slow = driven(guard, arm, random_torques(cell, 0, 800))
+    guard = GuardedArm(arm, TICK_S, speed_fraction=0.1)
+    _, slow = drive_cycles(guard, arm, random_torques(cell, 0, 800))
     assert (np.abs(slow) / cell.bounds.velocity).max() <= 0.1
     assert (arm.violations, arm.clipped > 50) == (0, True)
     guard.permit(1.0)
-    motion = driven(guard, arm, random_torques(cell, 0, 800))
+    motion = drive_cycles(guard, arm, random_torques(cell, 0, 800))
     assert (np.abs(motion[1]) / cell.bounds.velocity).max() > 0.1
-    assert max(excess(cell, motion)) <= 0.0
+    assert max(compute_excess(cell, motion)) <= 0.0
 
 
 def test_a_config_whose_arm_cannot_be_guarded_is_refused_before_the_launch() -> None:
@@ -244,6 +244,6 @@ def test_a_config_whose_arm_cannot_be_guarded_is_refused_before_the_launch() -> 
     (mistake,) = refused.value.mistakes
     assert (mistake.place, mistake.value) == ("board.servo.params.arm", "hardware_arm:HardwareArm")
     assert mistake.why == (
-        "robot.sensors: 'kj1' may be off by 0.00035 rad, 0.0035 rad/s: too coarse to keep it below"
-        " 0.001 rad/s; permitted: less than half of that"
+        "robot.sensors: 'kj1' may be off by 0.00035 rad, 0.0035 rad/s, which is too coarse to keep"
+        " it below 0.001 rad/s; it must be less than half of that"
     )

@@ -18,7 +18,7 @@ from rack.levels.arm.latency_compensation import PresentLink
 from rack.levels.messages import Error
 from rack.levels.robot.cell import Cell, build_cell
 from rack.levels.tables import RobotConfig, SceneConfig
-from tests.levels.arm.test_guard import TICK_S, driven, excess, random_torques
+from tests.levels.arm.test_guard import TICK_S, compute_excess, drive_cycles, random_torques
 from tests.levels.arm.test_own_arm import GOAL, START, IdealArm
 from tests.levels.arms import pendulum
 from tests.levels.lockstep import CLOCK_NS
@@ -30,7 +30,7 @@ COURSE = Course(START, GOAL, 0.8)
 class LateArm(IdealArm):
     """Its samples are `late` ticks old; from tick `stuck_from` on they keep their first joint."""
 
-    late = 0
+    build_late_arm = 0
     stuck_from = 1 << 30
 
     def __init__(self, *args: Any) -> None:
@@ -69,7 +69,7 @@ def arm() -> type[LateArm]:
     return LateArm
 
 
-def late(folder: Path, ticks: int) -> tuple[RobotConfig, Cell]:
+def build_late_arm(folder: Path, ticks: int) -> tuple[RobotConfig, Cell]:
     robot = pendulum(folder).model_copy(update={"latency_ticks": ticks})
     return robot, build_cell(robot, SceneConfig(), CLOCK_NS)
 
@@ -78,15 +78,15 @@ def rig(
     folder: Path, latency: int, name: str = "tests.levels.arm.test_latency_compensation:LateArm"
 ) -> ServoRig:
     params = {"arm": name} if name else {}
-    return ServoRig(late(folder, latency)[0], SceneConfig(), **params)
+    return ServoRig(build_late_arm(folder, latency)[0], SceneConfig(), **params)
 
 
 @pytest.mark.parametrize("ticks", [1, 3])
 @pytest.mark.parametrize("age", [0, 1, 3])
-def test_a_sample_is_brought_to_the_present_if_it_is_not_too_old(
+def test_a_sample_is_extrapolated_to_the_present_if_it_is_not_too_old(
     tmp_path: Path, arm: type[LateArm], ticks: int, age: int
 ) -> None:
-    _, cell = late(tmp_path, ticks)
+    _, cell = build_late_arm(tmp_path, ticks)
     arm.late = age
     own = arm(cell, SceneConfig(), CLOCK_NS)
     link = PresentLink(own, TICK_S)
@@ -145,11 +145,11 @@ def test_samples_older_than_the_config_permits_are_a_finding_with_their_age(
 
 
 @pytest.mark.slow
-def test_late_samples_lead_beyond_no_limit(tmp_path: Path, arm: type[LateArm]) -> None:
-    _, cell = late(tmp_path, 4)
+def test_late_samples_do_not_lead_beyond_a_limit(tmp_path: Path, arm: type[LateArm]) -> None:
+    _, cell = build_late_arm(tmp_path, 4)
     arm.late = 4
     own = arm(cell, SceneConfig(), CLOCK_NS)
     guard = GuardedArm(own, TICK_S, PresentLink(own, TICK_S))
-    assert max(excess(cell, driven(guard, own, random_torques(cell, 0, 800)))) <= 0.0
+    assert max(compute_excess(cell, drive_cycles(guard, own, random_torques(cell, 0, 800)))) <= 0.0
     assert own.clipped > 50
     assert own.violations == 0

@@ -96,7 +96,7 @@ def test_an_arm_named_in_the_config_is_driven_and_follows_its_set_points(rig: Se
     assert np.abs(scene.tool_position - tool.position).max() < 1e-3
 
 
-def test_a_restarted_board_restores_it(rig: ServoRig) -> None:
+def test_a_restarted_board_restores_the_arm(rig: ServoRig) -> None:
     rig.run(500, Course(START, GOAL, 1.0).at)
     rig.restart()
     rig.run(100, lambda _: (GOAL, np.zeros(2)))
@@ -115,7 +115,10 @@ def test_a_restarted_board_restores_it(rig: ServoRig) -> None:
             "rack.levels.arm:Sensed",
             "module 'rack.levels.arm' has no DrivableArm named 'Sensed'; it has: ",
         ),
-        ("tests.levels.arm.test_own_arm:HalfAnArm", "class 'HalfAnArm' lacks: brake, step"),
+        (
+            "tests.levels.arm.test_own_arm:HalfAnArm",
+            "class 'HalfAnArm' does not implement: brake, step",
+        ),
     ],
 )
 def test_a_class_that_is_no_arm_is_refused_before_launch(reference: str, why: str) -> None:

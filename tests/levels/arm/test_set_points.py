@@ -61,32 +61,34 @@ class ServoArm(IdealArm):
             self.tick += 1
 
 
-def simulated(name: str, interface: Interface) -> tuple[SimulatedArm, Cell]:
+def build_simulated(name: str, interface: Interface) -> tuple[SimulatedArm, Cell]:
     robot, scene = config(name)
     made = build_cell(robot.model_copy(update={"interface": interface}), scene, CLOCK_NS)
     made.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     return SimulatedArm(made, scene, CLOCK_NS), made
 
 
-def own(folder: Path, interface: Interface) -> tuple[ServoArm, GuardedArm]:
+def build_guarded(folder: Path, interface: Interface) -> tuple[ServoArm, GuardedArm]:
     robot = pendulum(folder, interface=interface)
     arm = ServoArm(build_cell(robot, SceneConfig(), CLOCK_NS), SceneConfig(), CLOCK_NS)
     return arm, GuardedArm(arm, TICK_S)
 
 
-def link_of(folder: Path, interface: Interface, is_own: bool) -> tuple[Arm, Arm | GuardedArm]:
+def build_link(folder: Path, interface: Interface, is_own: bool) -> tuple[Arm, Arm | GuardedArm]:
     if is_own:
-        return own(folder, interface)
-    arm, _ = simulated("puma560", interface)
+        return build_guarded(folder, interface)
+    arm, _ = build_simulated("puma560", interface)
     return arm, arm
 
 
-def hostile(cell: Cell, kind: str, cycles: int, seed: int = 3) -> Iterator[JointTarget]:
+def draw_hostile_targets(
+    cell: Cell, kind: str, cycles: int, seed: int = 3
+) -> Iterator[JointTarget]:
     """Yield set points that no level would give, after one where the arm starts."""
     random = np.random.default_rng(seed)
     low, high = np.clip(cell.bounds.position.T, -3.0, 3.0)
     fastest = cell.bounds.velocity
-    holding = load(cell)
+    holding = compute_load(cell)
     yield JointTarget(cell.home, 0.0 * fastest, holding)
     position, velocity = cell.home.copy(), np.zeros(len(cell.home))
     for cycle in range(cycles):
@@ -105,13 +107,13 @@ def hostile(cell: Cell, kind: str, cycles: int, seed: int = 3) -> Iterator[Joint
         yield JointTarget(position, velocity, holding)
 
 
-def load(cell: Cell) -> Array:
+def compute_load(cell: Cell) -> Array:
     """Return the torques, N m, that hold the arm at home."""
     data = cell.start()
     return np.asarray(data.qfrc_bias - data.qfrc_passive)[cell.dof]
 
 
-def saved(arm: SimulatedArm) -> Message:
+def save_state(arm: SimulatedArm) -> Message:
     state = ArmState.zeros(sizes(arm.cell))
     arm.save(state)
     return state
@@ -123,9 +125,9 @@ def saved(arm: SimulatedArm) -> Message:
 def test_no_set_points_move_the_simulated_arm_beyond_its_limits(
     interface: Interface, kind: str
 ) -> None:
-    arm, made = simulated("puma560", interface)
+    arm, made = build_simulated("puma560", interface)
     fastest = 0.0
-    for target in hostile(made, kind, 400):
+    for target in draw_hostile_targets(made, kind, 400):
         assert arm.follow(target, 0.0) is None
         arm.step(1)
         fastest = max(fastest, float(np.max(np.abs(arm.sense().velocity) / made.bounds.velocity)))
@@ -137,18 +139,18 @@ def test_no_set_points_move_the_simulated_arm_beyond_its_limits(
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["jumps", "beyond"])
 @pytest.mark.parametrize("interface", SET_POINTS)
-def test_nor_an_arm_of_ones_own_that_misses_cycles(
+def test_no_set_points_move_a_guarded_arm_beyond_its_limits_when_cycles_are_missed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, interface: Interface, kind: str
 ) -> None:
     # Its drives cycle at 4 kHz, so they may be quick.
     monkeypatch.setattr(simulated_arm, "VELOCITY_GAIN", 400.0)
 
     def beyond(is_guarded: bool) -> float:
-        arm, guard = own(tmp_path, interface)
+        arm, guard = build_guarded(tmp_path, interface)
         random = np.random.default_rng(1)
         low, high = arm.cell.bounds.position.T
         worst = -np.inf
-        for target in hostile(arm.cell, kind, 400):
+        for target in draw_hostile_targets(arm.cell, kind, 400):
             guard.sense()
             assert (guard if is_guarded else arm).follow(target, 0.0) is None or not is_guarded
             for _ in range(random.integers(1, arm.patience, endpoint=True)):
@@ -174,11 +176,11 @@ def test_nor_an_arm_of_ones_own_that_misses_cycles(
         ({"torque": 1e4}, Alarm.COMMAND_LIMIT),
     ],
 )
-def test_what_no_drive_may_have_engages_the_brakes(
+def test_an_invalid_set_point_engages_the_brakes(
     tmp_path: Path, interface: Interface, is_own: bool, wrong: dict[str, float], alarm: Alarm
 ) -> None:
-    arm, link = link_of(tmp_path, interface, is_own)
-    good = JointTarget(arm.cell.home, 0.0 * arm.cell.home, load(arm.cell))
+    arm, link = build_link(tmp_path, interface, is_own)
+    good = JointTarget(arm.cell.home, 0.0 * arm.cell.home, compute_load(arm.cell))
     link.sense()
     assert link.follow(good, 0.0) is None
     assert not arm.braked
@@ -201,10 +203,10 @@ def test_what_no_drive_may_have_engages_the_brakes(
 def test_the_first_set_point_after_brakes_must_be_where_the_arm_is(
     tmp_path: Path, interface: Interface, is_own: bool
 ) -> None:
-    arm, link = link_of(tmp_path, interface, is_own)
+    arm, link = build_link(tmp_path, interface, is_own)
     there = arm.cell.home.copy()
     there[1] += 0.02
-    away = JointTarget(there, 0.0 * there, load(arm.cell))
+    away = JointTarget(there, 0.0 * there, compute_load(arm.cell))
     for _ in range(3):
         link.sense()
         refused = link.follow(away, 0.0)
@@ -221,16 +223,16 @@ def test_the_first_set_point_after_brakes_must_be_where_the_arm_is(
 @pytest.mark.parametrize("interface", SET_POINTS)
 @pytest.mark.parametrize("missed", [0, 1, 5])
 def test_a_restored_arm_continues_bit_for_bit(interface: Interface, missed: int) -> None:
-    arm, made = simulated("puma560", interface)
-    targets = list(hostile(made, "jumps", 200))
+    arm, made = build_simulated("puma560", interface)
+    targets = list(draw_hostile_targets(made, "jumps", 200))
     for target in targets[:150]:
         arm.follow(target, 0.0)
         arm.step(1)
-    again, _ = simulated("puma560", interface)
-    again.restore(saved(arm))
+    again, _ = build_simulated("puma560", interface)
+    again.restore(save_state(arm))
     for each in (arm, again):
         each.step(missed)
         for target in targets[150:]:
             each.follow(target, 0.0)
             each.step(1)
-    assert saved(again).raw == saved(arm).raw
+    assert save_state(again).raw == save_state(arm).raw

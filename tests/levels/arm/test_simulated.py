@@ -25,18 +25,18 @@ Torque = Callable[[int], Array]
 TICK_S = CLOCK_NS * 1e-9
 
 
-def arm_of(name: str) -> tuple[SimulatedArm, Cell]:
+def build_arm(name: str) -> tuple[SimulatedArm, Cell]:
     made = cell(name)
     return SimulatedArm(made, config(name)[1], CLOCK_NS), made
 
 
-def saved(arm: SimulatedArm, made: Cell) -> Message:
+def save_state(arm: SimulatedArm, made: Cell) -> Message:
     state = ArmState.zeros(sizes(made))
     arm.save(state)
     return state
 
 
-def wobble(made: Cell) -> Torque:
+def build_wobble(made: Cell) -> Torque:
     """Torques that swing the arm about home, a function of the tick alone."""
     bias = Dynamics(made).terms(made.home, np.zeros(len(made.home))).bias.copy()
     return lambda tick: bias + 0.2 * made.bounds.torque * np.sin(0.05 * tick + np.arange(len(bias)))
@@ -86,35 +86,35 @@ def watched(monkeypatch: pytest.MonkeyPatch) -> Watch:
 
 
 def test_simulated_time_is_the_tick_times_the_period_exactly() -> None:
-    arm, made = arm_of("puma560")
+    arm, made = build_arm("puma560")
     time = mujoco.mj_stateSize(made.model, mujoco.mjtState.mjSTATE_TIME)
     for ticks in (1, 1, 7, 1, 30):
         arm.drive(np.zeros(6), 0.0)
         arm.step(ticks)
-        assert saved(arm, made).state[:time] == [arm.tick * CLOCK_NS * 1e-9]
+        assert save_state(arm, made).state[:time] == [arm.tick * CLOCK_NS * 1e-9]
     assert arm.tick == 40
 
 
 def test_a_restored_arm_continues_bit_for_bit() -> None:
-    arm, made = arm_of("puma560")
-    torque, middle = wobble(made), ArmState.zeros(sizes(made))
+    arm, made = build_arm("puma560")
+    torque, middle = build_wobble(made), ArmState.zeros(sizes(made))
     for tick in range(200):
         if tick == 120:
             arm.save(middle)
         arm.drive(torque(tick), 20.0)
         arm.step(1)
-    again, _ = arm_of("puma560")
+    again, _ = build_arm("puma560")
     again.restore(middle)
     assert (again.tick, again.grip_force) == (120, 20.0)
     for tick in range(120, 200):
         again.drive(torque(tick), 20.0)
         again.step(1)
-    assert saved(again, made).raw == saved(arm, made).raw
+    assert save_state(again, made).raw == save_state(arm, made).raw
 
 
 @pytest.mark.slow
 def test_limits_hold_at_every_step_whatever_is_commanded(watched: Watch) -> None:
-    arm, made = arm_of("puma560")
+    arm, made = build_arm("puma560")
     arm._model.opt.disableflags |= int(
         mujoco.mjtDisableBit.mjDSBL_CONTACT
     )  # a contact would stop the arm
@@ -138,27 +138,27 @@ def test_limits_hold_at_every_step_whatever_is_commanded(watched: Watch) -> None
     assert arm.violations == 0
 
 
-def test_a_broken_simulation_is_a_fault_that_leaves_the_last_sound_state(
+def test_a_broken_simulation_is_a_fault_that_leaves_the_last_valid_state(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    arm, made = arm_of("puma560")
+    arm, made = build_arm("puma560")
     arm.step(5)
-    sound = saved(arm, made)
+    sound = save_state(arm, made)
     arm._model.dof_damping[0] = np.nan
     arm.step(3)
     assert "MuJoCo warning mjWARN_BAD" in arm.fault
     assert arm.tick == 8
-    after = saved(arm, made)
+    after = save_state(arm, made)
     assert np.array_equal(after.state[1:], sound.state[1:])  # all but the time
     assert not list(tmp_path.iterdir())  # MuJoCo's own log file
 
 
 @pytest.mark.slow
-def test_arm_and_table_touching_is_counted_and_named_objects_on_the_table_are_not() -> None:
-    arm, made = arm_of("puma560")
+def test_contact_of_arm_and_table_is_counted_but_not_objects_on_the_table() -> None:
+    arm, made = build_arm("puma560")
     for _ in range(200):
-        arm.drive(wobble(made)(0), 0.0)
+        arm.drive(build_wobble(made)(0), 0.0)
         arm.step(1)
     assert (arm.touches, arm.first_touch) == (0, "")
     for _ in range(800):

@@ -19,18 +19,18 @@ CLOCK_NS = 1_000_000
 STILL = np.zeros(6)
 
 
-def arm_of(folder: Path, home: tuple[float, ...] | None = None, **wrist: float) -> SimulatedArm:
+def build_arm(folder: Path, home: tuple[float, ...] | None = None, **wrist: float) -> SimulatedArm:
     robot, scene = pad(folder, **wrist)
     robot = robot if home is None else robot.model_copy(update={"home": home})
     return SimulatedArm(build_cell(robot, scene, CLOCK_NS), scene, CLOCK_NS, seed=7)
 
 
-def contact_of(arm: SimulatedArm) -> ContactWrench:
+def find_contact(arm: SimulatedArm) -> ContactWrench:
     assert arm.cell.wrist is not None
     return ContactWrench(arm.cell, arm.cell.wrist, arm.dynamics)
 
 
-def felt(arm: SimulatedArm) -> Array:
+def sense_wrist(arm: SimulatedArm) -> Array:
     sample = arm.feel()
     assert sample is not None
     return sample
@@ -57,15 +57,15 @@ def test_a_push_on_the_tool_is_the_wrench_of_the_contact(
     tmp_path: Path, home: tuple[float, ...]
 ) -> None:
     arm, force, torque = (
-        arm_of(tmp_path, home),
+        build_arm(tmp_path, home),
         np.array([5.0, -9.0, 12.0]),
         np.array([0.4, 0.3, -0.2]),
     )
     for _ in range(200):
         push(arm, force, torque)
         arm.step(1)
-    contact = contact_of(arm)
-    contact.take(felt(arm), np.array(arm._state), STILL)
+    contact = find_contact(arm)
+    contact.take(sense_wrist(arm), np.array(arm._state), STILL)
     assert np.allclose(contact.wrench, (*force, *torque), atol=0.02)
     jacobian = np.zeros((6, arm.cell.model.nv))
     mujoco.mj_jacSite(arm.cell.model, arm._data, jacobian[:3], jacobian[3:], arm.cell.tool)
@@ -74,7 +74,7 @@ def test_a_push_on_the_tool_is_the_wrench_of_the_contact(
 
 
 def test_a_restored_arm_senses_the_same_bits(tmp_path: Path) -> None:
-    arms = [arm_of(tmp_path, noise=0.2) for _ in range(2)]
+    arms = [build_arm(tmp_path, noise=0.2) for _ in range(2)]
     state = ArmState.zeros(sizes(arms[0].cell))
     for _ in range(40):
         arms[0].drive(arms[0].dynamics.terms(*arms[0]._state).bias, 0.0)
@@ -83,4 +83,4 @@ def test_a_restored_arm_senses_the_same_bits(tmp_path: Path) -> None:
     arms[1].restore(state)
     for arm in arms:
         arm.step(1)
-    assert felt(arms[0]).tobytes() == felt(arms[1]).tobytes()
+    assert sense_wrist(arms[0]).tobytes() == sense_wrist(arms[1]).tobytes()

@@ -11,7 +11,7 @@ CORNERED = np.array([[0.0, 0.0, 0.0], [1.0, 0.2, -0.3], [1.2, 1.0, 0.1], [0.4, 1
 BLEND = np.array([0.0, 0.3, 0.25, 0.0])
 
 
-def points(path: BlendedPath, s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def evaluate_points(path: BlendedPath, s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     q, dq, d2q = zip(*(tuple(a.copy() for a in path.evaluate(x)) for x in s), strict=True)
     return np.array(q), np.array(dq), np.array(d2q)
 
@@ -19,9 +19,9 @@ def points(path: BlendedPath, s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
 def test_derivatives_agree_with_finite_differences() -> None:
     path, step = BlendedPath(CORNERED, BLEND), 1e-5
     s = np.linspace(step, path.length - step, 2003)
-    _, dq, d2q = points(path, s)
-    ahead, ahead_dq, _ = points(path, s + step)
-    behind, behind_dq, _ = points(path, s - step)
+    _, dq, d2q = evaluate_points(path, s)
+    ahead, ahead_dq, _ = evaluate_points(path, s + step)
+    behind, behind_dq, _ = evaluate_points(path, s - step)
     assert np.abs((ahead - behind) / (2 * step) - dq).max() < 1e-8
     assert (
         np.abs((ahead_dq - behind_dq) / (2 * step) - d2q).max() < 2e-4
@@ -32,7 +32,7 @@ def test_analytic_bounds_hold_and_are_tight_on_every_piece() -> None:
     path = BlendedPath(CORNERED, BLEND)
     for k, (start, end) in enumerate(zip(path.breaks[:-1], path.breaks[1:], strict=True)):
         s = np.linspace(start, end - 1e-12, 400)
-        _, dq, d2q = points(path, s)
+        _, dq, d2q = evaluate_points(path, s)
         third = np.diff(d2q, axis=0) / (s[1] - s[0])
         assert (np.abs(dq).max(axis=0) <= path.bounds.first[k] + 1e-9).all()
         assert (np.abs(d2q).max(axis=0) <= path.bounds.second[k] + 1e-9).all()
@@ -76,7 +76,7 @@ def test_coincident_waypoints_count_once_with_the_smaller_blend() -> None:
         ([[0.0], [float("nan")]], [0.0, 0.0], "finite"),
     ],
 )
-def test_path_that_cannot_be_is_refused(waypoints: list, blend: list, offender: str) -> None:
+def test_an_invalid_path_is_refused(waypoints: list, blend: list, offender: str) -> None:
     with pytest.raises(ValueError, match=offender):
         BlendedPath(waypoints, blend)
 
@@ -93,7 +93,7 @@ def test_samples_are_the_points_of_the_path_both_ends_included() -> None:
     path = BlendedPath(CORNERED, BLEND)
     samples = path.sample(0.01)
     places = np.linspace(0.0, path.length, len(samples))
-    assert np.array_equal(samples, points(path, places)[0])
+    assert np.array_equal(samples, evaluate_points(path, places)[0])
     assert np.array_equal(samples, points_at(path._marks, path._table, places))
     assert np.linalg.norm(np.diff(samples, axis=0), axis=1).max() <= 0.01
     assert BlendedPath(CORNERED[:1], [0.0]).sample(0.01).tolist() == CORNERED[:1].tolist()

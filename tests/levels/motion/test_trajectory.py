@@ -41,7 +41,7 @@ def random_path(seed: int, corners: int, scale: float = 0.6, stops: bool = False
     return BlendedPath(waypoints, blend)
 
 
-def used(
+def compute_usage(
     path: BlendedPath, trajectory: Trajectory, samples: int = 3000
 ) -> tuple[float, float, float]:
     """Return the largest parts of velocity, acceleration and jerk limits that densely sampled
@@ -68,7 +68,7 @@ def used(
 @pytest.mark.parametrize(("seed", "corners"), [(1, 0), (2, 1), (3, 4), (1, 9)])
 def test_every_joint_keeps_velocity_acceleration_and_jerk_limits(seed: int, corners: int) -> None:
     path = random_path(seed, corners, stops=seed == 3)
-    assert max(used(path, make_trajectory(path, ARM))) <= 1.0 + EXACT
+    assert max(compute_usage(path, make_trajectory(path, ARM))) <= 1.0 + EXACT
 
 
 @pytest.mark.parametrize("corners", [0, 1, 4, WAYPOINTS - 2])
@@ -85,7 +85,7 @@ def test_trajectory_goes_from_rest_at_the_begin_to_rest_at_the_end(corners: int)
 
 def test_straight_line_uses_velocity_and_acceleration_limits_fully() -> None:
     path = BlendedPath([np.zeros(6), np.array([2.5, 1.0, 0.5, 0.0, 0.0, 0.0])], [0.0, 0.0])
-    velocity, acceleration, jerk = used(path, make_trajectory(path, ARM))
+    velocity, acceleration, jerk = compute_usage(path, make_trajectory(path, ARM))
     assert velocity == pytest.approx(1.0, abs=1e-6)
     assert acceleration == pytest.approx(1.0, abs=1e-6)
     assert jerk == pytest.approx(1.0, abs=1e-6)
@@ -107,7 +107,7 @@ def test_motion_rests_at_every_stop_of_the_path_and_no_stop_overruns_it() -> Non
             assert stop.end <= path.stops[0] + 1e-8
 
 
-def test_nothing_to_drive_takes_no_time() -> None:
+def test_a_path_without_length_takes_no_time() -> None:
     trajectory = make_trajectory(BlendedPath([np.ones(6)], [0.0]), ARM)
     assert trajectory.duration == 0.0
     assert trajectory.at(0.0) == (0.0, 0.0, 0.0)
@@ -116,7 +116,7 @@ def test_nothing_to_drive_takes_no_time() -> None:
     assert (stop.begin, stop.end, stop.duration) == (0.25, 0.25, 0.0)
 
 
-def test_stretched_trajectory_takes_exactly_the_time_asked_for_on_the_same_path() -> None:
+def test_a_stretched_trajectory_takes_exactly_the_requested_time_on_the_same_path() -> None:
     path = random_path(8, 2)
     quick = make_trajectory(path, ARM)
     slow = quick.stretched(7.25 / quick.duration)
@@ -125,14 +125,14 @@ def test_stretched_trajectory_takes_exactly_the_time_asked_for_on_the_same_path(
     assert slow.at(0.3 * slow.duration).s == pytest.approx(
         quick.at(0.3 * quick.duration).s, rel=1e-9
     )
-    velocity, acceleration, jerk = used(path, slow)
+    velocity, acceleration, jerk = compute_usage(path, slow)
     factor = slow.duration / quick.duration
     assert velocity <= 1.0 / factor + EXACT
     assert acceleration <= 1.0 / factor**2 + EXACT
     assert jerk <= 1.0 / factor**3 + EXACT
 
 
-def test_reachable_speed_needs_just_the_length_given() -> None:
+def test_a_reachable_speed_needs_exactly_the_given_length() -> None:
     for start, length in [(0.0, 0.01), (0.0, 0.5), (0.3, 0.05), (0.7, 0.4)]:
         limits = SpeedLimits(100.0, 2.0, 20.0)
         change = reachable_speed(start, length, limits) - start
@@ -173,7 +173,7 @@ def test_stop_keeps_the_joint_limits_and_stays_on_the_path(corners: int) -> None
         assert stop.at(0.0) == pytest.approx(motion, abs=1e-9)
         assert stop.at(stop.duration)[1:] == pytest.approx((0.0, 0.0), abs=1e-6)
         assert motion.s <= stop.end <= path.length + 1e-8
-        velocity, acceleration, jerk = used(path, stop, 200)
+        velocity, acceleration, jerk = compute_usage(path, stop, 200)
         assert velocity <= 1.0 + EXACT
         assert max(acceleration, jerk) <= 1.5 + 1e-5
     assert stops > 20

@@ -20,11 +20,11 @@ def cell() -> Cell:
 
 
 @pytest.fixture(scope="module")
-def found(cell: Cell) -> Abilities:
+def find_abilities(cell: Cell) -> Abilities:
     return abilities(cell)
 
 
-def worst(cell: Cell, payload: float = 0.0) -> tuple[float, int]:
+def find_worst_load(cell: Cell, payload: float = 0.0) -> tuple[float, int]:
     """Return the largest part of a joint's torque that gravity takes, by the controller's own
     model, and the joint."""
     statics = Statics(cell)
@@ -41,24 +41,26 @@ def worst(cell: Cell, payload: float = 0.0) -> tuple[float, int]:
     return float(np.max(parts)), joint
 
 
-def test_the_payload_takes_all_of_one_joints_torque(cell: Cell, found: Abilities) -> None:
-    part, joint = worst(cell)
-    assert found.left == pytest.approx(1.0 - part, abs=1e-9)
-    assert found.joint == joint
-    assert worst(cell, found.payload)[0] == pytest.approx(1.0, abs=1e-6)
-    assert worst(cell, 0.99 * found.payload)[0] < 1.0
+def test_the_payload_uses_up_the_torque_of_one_joint(cell: Cell, find_abilities: Abilities) -> None:
+    part, joint = find_worst_load(cell)
+    assert find_abilities.left == pytest.approx(1.0 - part, abs=1e-9)
+    assert find_abilities.joint == joint
+    assert find_worst_load(cell, find_abilities.payload)[0] == pytest.approx(1.0, abs=1e-6)
+    assert find_worst_load(cell, 0.99 * find_abilities.payload)[0] < 1.0
 
 
-def test_stretched_out_no_single_joint_reaches_farther(cell: Cell, found: Abilities) -> None:
+def test_no_single_joint_extends_the_reach_of_a_stretched_arm(
+    cell: Cell, find_abilities: Abilities
+) -> None:
     # The PUMA 560: upper arm 0.4318 m, forearm 0.4331 m with 20 mm beside it, the tool beyond the
     # wrist, all 0.15 m beside the axis of the first joint.
     wrist = 0.4318 + np.hypot(0.4331, 0.0203)
-    assert np.hypot(wrist, 0.15) < found.reach < np.hypot(wrist + 0.25, 0.15)
+    assert np.hypot(wrist, 0.15) < find_abilities.reach < np.hypot(wrist + 0.25, 0.15)
     statics = Statics(cell)
     poses = statics.poses()
     far = statics.stretched(max(poses, key=statics.distance))
-    assert statics.distance(far) == pytest.approx(found.reach)
-    assert found.reach >= max(map(statics.distance, poses))
+    assert statics.distance(far) == pytest.approx(find_abilities.reach)
+    assert find_abilities.reach >= max(map(statics.distance, poses))
     low, high = cell.limits.position.T
     assert ((low - 1e-12 <= far) & (far <= high + 1e-12)).all()
     assert all(((low <= position) & (position <= high)).all() for position in poses)

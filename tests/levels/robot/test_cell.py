@@ -68,7 +68,7 @@ def test_a_free_body_listed_before_the_arm_shifts_no_index(tmp_path: Path) -> No
         ('<general jointinparent="shoulder" gainprm="10" ctrlrange="-3 3"/>', 30.0),
     ],
 )
-def test_whatever_drives_a_joint_becomes_a_torque_motor_with_its_limit(
+def test_any_drive_of_a_joint_becomes_a_torque_motor_with_its_limit(
     tmp_path: Path, shoulder: str, limit: float
 ) -> None:
     made = build(pendulum(tmp_path, shoulder + '<motor joint="elbow" ctrlrange="-20 20"/>'))
@@ -81,7 +81,7 @@ def test_whatever_drives_a_joint_becomes_a_torque_motor_with_its_limit(
     assert data.qfrc_actuator[made.dof] == pytest.approx([1.5, -2.5])
 
 
-def test_sensors_and_keyframes_of_replaced_actuators_go_with_them(tmp_path: Path) -> None:
+def test_sensors_and_keyframes_of_replaced_actuators_are_removed(tmp_path: Path) -> None:
     robot = pendulum(tmp_path, MOTORS.replace("<motor", '<motor name="m"', 1))
     text = robot.model.read_text()
     extra = (
@@ -118,13 +118,16 @@ WRONG_CONFIGS = {
     ),
     "twice": ({"joints": ("elbow", "elbow")}, "'elbow' is named 2 times"),
     "tool": ({"tool": "tcp"}, "robot.tool: no site 'tcp' in the model; it has: tip"),
-    "length": ({"velocity": (1.0,)}, "robot.velocity: 1 values; permitted: 2, one per joint"),
-    "home outside": ({"home": (0.0, 2.5)}, "joint 'elbow' at 2.5 rad; -1.995 to 1.995 is valid"),
+    "length": ({"velocity": (1.0,)}, "robot.velocity: has 1 values but needs 2, one per joint"),
+    "home outside": (
+        {"home": (0.0, 2.5)},
+        "joint 'elbow' is at 2.5 rad; it must be -1.995 to 1.995",
+    ),
     "home touches": ({"home": (1.5, 0.5)}, "'floor' touches 'lower'"),
-    "too weak": ({"torque": (1.0, 20.0)}, "joint 'shoulder' carries"),
+    "too weak": ({"torque": (1.0, 20.0)}, "joint 'shoulder' needs"),
     "no range": (
         {"position": ((2.5, 3.0), (-1.0, 1.0))},
-        "joint 'shoulder' has no room from 2.5 to 2 rad",
+        "joint 'shoulder' cannot move from 2.5 to 2 rad",
     ),
     "gripper": ({"gripper": gripper()}, "'grip' is not in the model"),
 }
@@ -147,7 +150,7 @@ WRONG_SCENES = {
         "no body 'cup' in the model; it has: world, block, upper, lower",
     ),
     "not free": (SceneConfig(objects=("lower",)), "body 'lower' has no free joint"),
-    "obstacle": (SceneConfig(obstacles=("block",)), "body 'block' cannot move by itself"),
+    "obstacle": (SceneConfig(obstacles=("block",)), "body 'block' is not a mocap body"),
     "support": (SceneConfig(supports=("shelf",)), "no geom 'shelf' in the model"),
     "no support": (SceneConfig(objects=("block",)), "'floor' touches 'block'"),
 }
@@ -165,12 +168,15 @@ def test_a_scene_that_does_not_fit_the_model_is_refused_in_one_line(
 
 
 WRONG_MODELS = {
-    "nan step": ({"timestep": "nan"}, "<option>: timestep = 'nan'; valid: finite numbers"),
-    "no step": ({"timestep": "0"}, "timestep 0 s is not valid"),
-    "long step": ({"timestep": "2.5"}, "timestep 2.5 s is not valid; above 0, at most 0.1"),
+    "nan step": ({"timestep": "nan"}, "<option>: timestep = 'nan'; it must be finite numbers"),
+    "no step": ({"timestep": "0"}, "timestep 0 s is invalid"),
+    "long step": (
+        {"timestep": "2.5"},
+        "timestep 2.5 s is invalid; it must be above 0 and at most 0.1",
+    ),
     "no limit": (
         {"actuators": '<motor joint="shoulder"/>'},
-        "joint 'shoulder': the model gives no torque limit",
+        "joint 'shoulder': the model has no torque limit",
     ),
     "ball": (
         {
@@ -210,5 +216,5 @@ def test_a_model_that_cannot_be_used_is_refused_in_one_line(tmp_path: Path, case
     joints = ("shoulder2", "elbow") if case == "ball" else ("shoulder", "elbow")
     with pytest.raises(RobotError) as refused:
         build(pendulum(tmp_path, **changed, joints=joints))
-    assert (message or "'shoulder2' is a ball joint; valid: hinge, slide") in str(refused.value)
+    assert (message or "'shoulder2' is a ball joint, must be hinge or slide") in str(refused.value)
     assert "\n" not in str(refused.value)

@@ -53,7 +53,7 @@ TIED = {
 }
 
 
-def coupled(folder: Path, more: str, actuators: str = MOTORS) -> RobotConfig:
+def write_coupled_arm(folder: Path, more: str, actuators: str = MOTORS) -> RobotConfig:
     """Write an arm with `more` sections in its model."""
     robot = pendulum(folder, actuators, POST + TARGET + FLAP, torque=(45.0, 10.0))
     text = robot.model.read_text()
@@ -66,7 +66,7 @@ def test_a_joint_of_the_arm_that_is_tied_is_refused_by_name(
     tmp_path: Path, more: str, names: str
 ) -> None:
     with pytest.raises(RobotError) as refused:
-        build_cell(coupled(tmp_path, more), SceneConfig(), CLOCK_NS)
+        build_cell(write_coupled_arm(tmp_path, more), SceneConfig(), CLOCK_NS)
     text = str(refused.value)
     assert names in text
     assert "driven independently; remove it from the model" in text
@@ -82,8 +82,8 @@ def test_a_joint_of_the_arm_that_is_tied_is_refused_by_name(
         PAIR,
     ],
 )
-def test_what_ties_no_joint_of_the_arm_is_permitted(tmp_path: Path, more: str) -> None:
-    build_cell(coupled(tmp_path, more), SceneConfig(), CLOCK_NS)
+def test_an_equality_that_ties_no_joint_of_the_arm_is_permitted(tmp_path: Path, more: str) -> None:
+    build_cell(write_coupled_arm(tmp_path, more), SceneConfig(), CLOCK_NS)
 
 
 def test_joints_that_share_an_actuator_are_refused_unless_there_is_one_for_each(
@@ -91,5 +91,5 @@ def test_joints_that_share_an_actuator_are_refused_unless_there_is_one_for_each(
 ) -> None:
     one, other = '<motor name="winch" tendon="pair"/>', '<motor tendon="sum"/>'
     with pytest.raises(RobotError, match="joints elbow, shoulder share one actuator"):
-        build_cell(coupled(tmp_path, PAIR, one), SceneConfig(), CLOCK_NS)
-    build_cell(coupled(tmp_path, PAIR, one + other), SceneConfig(), CLOCK_NS)
+        build_cell(write_coupled_arm(tmp_path, PAIR, one), SceneConfig(), CLOCK_NS)
+    build_cell(write_coupled_arm(tmp_path, PAIR, one + other), SceneConfig(), CLOCK_NS)

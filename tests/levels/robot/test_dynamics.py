@@ -76,7 +76,7 @@ def test_k1607_gravity_matches_the_published_vectors(row: int) -> None:
 
 
 @pytest.mark.parametrize("name", ["puma560", "k1607"])
-def test_torques_from_the_equation_give_the_acceleration_that_was_wanted(name: str) -> None:
+def test_torques_from_the_equation_of_motion_give_the_requested_acceleration(name: str) -> None:
     made = cell(name)
     dynamics, rng = Dynamics(made), np.random.default_rng(3)
     joints = len(made.qpos)
@@ -93,7 +93,7 @@ def test_torques_from_the_equation_give_the_acceleration_that_was_wanted(name: s
     assert data.qacc[made.dof] == pytest.approx(wanted, abs=0.05)
 
 
-def test_terms_do_not_depend_on_what_was_asked_before(puma: Cell) -> None:
+def test_terms_do_not_depend_on_earlier_evaluations(puma: Cell) -> None:
     rng = np.random.default_rng(4)
     asked, fresh = Dynamics(puma), Dynamics(puma)
     q, qd = rng.uniform(-1, 1, (2, 6))
@@ -111,7 +111,7 @@ def test_terms_do_not_depend_on_what_was_asked_before(puma: Cell) -> None:
 
 
 @pytest.mark.parametrize("name", ["puma560", "k1607"])
-def test_terms_are_bit_for_bit_those_of_a_whole_forward_pass(name: str) -> None:
+def test_terms_equal_a_full_forward_pass_bit_for_bit(name: str) -> None:
     made, rng = cell(name), np.random.default_rng(9)
     dynamics, data, full = Dynamics(made), made.start(), np.zeros((made.model.nv, made.model.nv))
     made.model.opt.disableflags |= int(OFF)

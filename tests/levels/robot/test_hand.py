@@ -18,7 +18,7 @@ CLOCK_NS = 500_000
 FLEXOR = '<general class="tendon" name="index0_flexor" tendon="index0_flexor"/>'
 TENDON = '<fixed name="index0_flexor"><joint joint="index0" coef="-.012"/></fixed>'
 NO_TENSION = (
-    "actuator 'index0_flexor' must pull a tendon, and nothing else, by its control, N: valid are a"
+    "actuator 'index0_flexor' must pull one tendon, with its control as tension, N: it needs a"
     " fixed gain of 1, no bias, a gear of -1, and a range from 0 or more to above robot.hand.least = 2"
 )
 EXTENSOR = '<fixed name="index0_extensor"><joint joint="index0" coef=".012"/></fixed>'
@@ -28,7 +28,7 @@ def build(robot: RobotConfig) -> Cell:
     return build_cell(robot, config("utah_mit")[1], CLOCK_NS)
 
 
-def changed(folder: Path, old: str, new: str) -> RobotConfig:
+def replace_in_model(folder: Path, old: str, new: str) -> RobotConfig:
     """Return the hand with `old` in its model replaced."""
     text = (ROBOTS / "utah_mit.xml").read_text()
     assert text.count(old) == 1, old
@@ -36,7 +36,7 @@ def changed(folder: Path, old: str, new: str) -> RobotConfig:
     return config("utah_mit")[0].model_copy(update={"model": folder / "hand.xml"})
 
 
-def retold(**hand: Any) -> RobotConfig:
+def replace_in_table(**hand: Any) -> RobotConfig:
     """Return the hand with keys of `[robot.hand]` replaced."""
     robot = config("utah_mit")[0]
     assert robot.hand is not None
@@ -76,10 +76,10 @@ def test_the_palm_belongs_to_the_hand_and_may_touch_what_it_holds() -> None:
         name: made.model.geom(name).id
         for name in ("palm", "can", "stand", "index_pad", "thumb_pad")
     }
-    assert not made.touch[geom["palm"], geom["can"]]
-    assert not made.touch[geom["index_pad"], geom["thumb_pad"]]
-    assert not made.touch[geom["can"], geom["stand"]]
-    assert made.touch[geom["index_pad"], geom["stand"]]
+    assert not made.geoms.touch[geom["palm"], geom["can"]]
+    assert not made.geoms.touch[geom["index_pad"], geom["thumb_pad"]]
+    assert not made.geoms.touch[geom["can"], geom["stand"]]
+    assert made.geoms.touch[geom["index_pad"], geom["stand"]]
 
 
 @pytest.mark.parametrize(
@@ -97,14 +97,14 @@ def test_the_palm_belongs_to_the_hand_and_may_touch_what_it_holds() -> None:
         (TENDON, TENDON.replace("-.012", ".012"), "on joint 'index0' are -0.012 to 0.012 m"),
         (EXTENSOR, EXTENSOR.replace(".012", "-.012"), "on joint 'index0' are -0.012 to 0.012 m"),
         (EXTENSOR, EXTENSOR.replace(".012", ".010"), "on joint 'index0' are 0.01 to 0.012 m"),
-        (TENDON, TENDON.replace("</fixed>", '<joint joint="index1" coef=".01"/></fixed>'), "tendon of joint 'index0' turns joint 'index1', too"),
+        (TENDON, TENDON.replace("</fixed>", '<joint joint="index1" coef=".01"/></fixed>'), "tendon of joint 'index0' also turns joint 'index1'"),
     ],
 )  # fmt: skip
-def test_a_tendon_that_is_no_half_of_a_pair_is_refused(
+def test_a_tendon_that_is_not_part_of_a_pair_is_refused(
     tmp_path: Path, old: str, new: str, why: str
 ) -> None:
     with pytest.raises(RobotError, match=r"robot\.hand") as refused:
-        build(changed(tmp_path, old, new))
+        build(replace_in_model(tmp_path, old, new))
     assert why in str(refused.value)
     assert "\n" not in str(refused.value)
 
@@ -112,17 +112,20 @@ def test_a_tendon_that_is_no_half_of_a_pair_is_refused(
 @pytest.mark.parametrize(
     ("what", "why"),
     [
-        ({"least": 15.0}, "robot.hand.rest: 15 N; above robot.hand.least = 15 N is valid"),
-        ({"rest": 100.0}, "robot.hand.rest: 100 N; below the largest tension, 100 N, is valid"),
-        ({"flexors": ("index0_flexor",)}, "robot.hand.flexors: 1 values; one per joint: 16"),
+        ({"least": 15.0}, "robot.hand.rest: 15 N must be above robot.hand.least, 15 N"),
+        ({"rest": 100.0}, "robot.hand.rest: 100 N must be below the largest tension, 100 N"),
+        (
+            {"flexors": ("index0_flexor",)},
+            "robot.hand.flexors: has 1 values but needs 16, one per joint",
+        ),
     ],
 )
 def test_tensions_and_lists_that_do_not_fit_are_refused(what: dict[str, Any], why: str) -> None:
     with pytest.raises(RobotError, match=why):
-        build(retold(**what))
+        build(replace_in_table(**what))
 
 
-def test_a_hand_has_neither_gripper_nor_torque_limits_of_its_own() -> None:
+def test_a_hand_has_no_gripper_and_no_torque_limits() -> None:
     robot = config("utah_mit")[0]
     with pytest.raises(
         RobotError, match=r"robot\.torque: torques of a hand follow from its tendons"

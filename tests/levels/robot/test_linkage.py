@@ -14,7 +14,7 @@ from rack.levels.robot.cell import Cell, build_cell
 from tests.levels.arms import CLOCK_NS, four_bar
 
 
-def built(folder: Path, old: str = "", new: str = "") -> Cell:
+def build_linkage_cell(folder: Path, old: str = "", new: str = "") -> Cell:
     """Return the cell with the four-bar gripper, with one change to its model."""
     robot, scene = four_bar(folder)
     arm = folder / "puma560.xml"
@@ -22,7 +22,7 @@ def built(folder: Path, old: str = "", new: str = "") -> Cell:
     return build_cell(robot, scene, CLOCK_NS)
 
 
-def settled(made: Cell, force: float) -> mujoco.MjData:
+def settle_gripper(made: Cell, force: float) -> mujoco.MjData:
     """Return the simulated cell after a second with `force` on the gripper, its arm held at
     home."""
     assert made.gripper is not None
@@ -34,7 +34,7 @@ def settled(made: Cell, force: float) -> mujoco.MjData:
     return data
 
 
-def away(made: Cell, data: mujoco.MjData) -> float:
+def compute_deviation(made: Cell, data: mujoco.MjData) -> float:
     """Return how far the farthest joint of the gripper is from where the linkage puts it, in
     rad."""
     assert made.gripper is not None
@@ -44,17 +44,17 @@ def away(made: Cell, data: mujoco.MjData) -> float:
 
 
 def test_closed_loops_are_posed_as_the_simulation_settles(tmp_path: Path) -> None:
-    made = built(tmp_path)
+    made = build_linkage_cell(tmp_path)
     assert made.gripper is not None
     assert len(made.gripper.linkage.joints) == 5
-    assert away(made, made.start()) == 0.0
+    assert compute_deviation(made, made.start()) == 0.0
     data = made.start()
     data.qpos[made.gripper.linkage.driven] = 0.35
     made.gripper.linkage.set(data.qpos, 0.35)
     mujoco.mj_forward(made.model, data)
     equality = data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY
     assert np.abs(data.efc_pos[equality]).max() < 1e-5
-    assert away(made, settled(made, -1.0)) < 1e-3
+    assert compute_deviation(made, settle_gripper(made, -1.0)) < 1e-3
 
 
 @pytest.mark.parametrize(
@@ -63,16 +63,16 @@ def test_closed_loops_are_posed_as_the_simulation_settles(tmp_path: Path) -> Non
         (
             '<connect name="loop_left"',
             '<weld name="loop_left"',
-            r"robot\.gripper: equality 'loop_left' is \d",
+            r"robot\.gripper: equality 'loop_left' is off by \d",
         ),
         ('<connect name="loop_left"', "<weld", "equality <weld> of 'rod_left' and 'tip_left' is"),
     ],
 )
-def test_linkage_that_cannot_move_as_wanted_is_refused_by_the_name_of_its_equality(
+def test_a_linkage_that_cannot_move_is_refused_with_the_name_of_its_equality(
     tmp_path: Path, old: str, new: str, words: str
 ) -> None:
     with pytest.raises(RobotError, match=words):
-        built(tmp_path, old, new)
+        build_linkage_cell(tmp_path, old, new)
 
 
 @pytest.mark.parametrize(
@@ -82,4 +82,4 @@ def test_joint_that_nothing_determines_is_refused_by_name(
     tmp_path: Path, equality: str, joint: str
 ) -> None:
     with pytest.raises(RobotError, match=rf"robot\.gripper: joint '{joint}' follows nothing"):
-        built(tmp_path, f'name="{equality}"', f'name="{equality}" active="false"')
+        build_linkage_cell(tmp_path, f'name="{equality}"', f'name="{equality}" active="false"')

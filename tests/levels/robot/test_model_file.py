@@ -22,14 +22,14 @@ def scene(world: str = "", head: str = "") -> str:
     return f"<mujoco>{head}<worldbody>{world}</worldbody></mujoco>"
 
 
-def written(folder: Path, **texts: str) -> Path:
+def write_files(folder: Path, **texts: str) -> Path:
     """Write XML files by their names; return the path of the first."""
     for name, text in texts.items():
         (folder / f"{name}.xml").write_text(text)
     return folder / f"{next(iter(texts))}.xml"
 
 
-def refusal(path: Path) -> str:
+def find_refusal(path: Path) -> str:
     with pytest.raises(RobotError) as refused:
         compile_spec(load_spec(path), path)
     assert "\n" not in str(refused.value)
@@ -41,7 +41,7 @@ def asset(text: str) -> str:
 
 
 STRIP = '<compiler strippath="true"/>'
-NUMBER = "valid: finite numbers"
+NUMBER = "it must be finite numbers"
 PARTS = f"more than {MOST_PARTS} bodies, joints, geoms and sites, with all replicas"
 REFUSED = {
     "replicate": (scene(f'<replicate count="100000">{PART}</replicate>'), PARTS),
@@ -95,7 +95,7 @@ def test_a_model_on_which_mujoco_would_hang_or_fail_is_refused_in_one_line(
     tmp_path: Path, case: str
 ) -> None:
     text, why = REFUSED[case]
-    assert why in refusal(written(tmp_path, bad=text))
+    assert why in find_refusal(write_files(tmp_path, bad=text))
 
 
 @pytest.mark.parametrize(
@@ -116,26 +116,26 @@ def test_a_model_on_which_mujoco_would_hang_or_fail_is_refused_in_one_line(
 def test_a_fifo_in_place_of_any_file_is_refused_and_never_waited_for(
     tmp_path: Path, text: str
 ) -> None:
-    model = written(tmp_path, bad=text, folders='<mujoco><compiler assetdir="sub"/></mujoco>')
+    model = write_files(tmp_path, bad=text, folders='<mujoco><compiler assetdir="sub"/></mujoco>')
     folder = tmp_path / "sub" if "folders.xml" in text else tmp_path
     folder.mkdir(exist_ok=True)
     os.mkfifo(folder / "pipe")
-    assert f"{folder / 'pipe'}': not a regular file, but a FIFO" in refusal(model)
-    assert "pipe': not a regular file, but a FIFO" in refusal(folder / "pipe")
+    assert f"{folder / 'pipe'}': not a regular file, but a FIFO" in find_refusal(model)
+    assert "pipe': not a regular file, but a FIFO" in find_refusal(folder / "pipe")
 
 
 def test_an_image_that_would_take_all_memory_is_refused(tmp_path: Path) -> None:
     head = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + struct.pack(">II", 30_000, 30_000)
     (tmp_path / "huge.png").write_bytes(head)
-    model = written(tmp_path, bad=asset('<texture name="t" type="2d" file="huge.png"/>'))
-    assert "huge.png': more than 70000000 pixels" in refusal(model)
+    model = write_files(tmp_path, bad=asset('<texture name="t" type="2d" file="huge.png"/>'))
+    assert "huge.png': more than 70000000 pixels" in find_refusal(model)
 
 
 def test_elements_and_attributes_with_a_prefix_are_ignored_in_included_files_too(
     tmp_path: Path,
 ) -> None:
     body = '<geom size="1" a:b="2" name="{}"/><no:such size="1"><geom size="x"/></no:such>'
-    model = written(
+    model = write_files(
         tmp_path,
         main=scene(body.format("own"), '<include file="more.xml"/>'),
         more=f'<mujoco xmlns:c="urn:c" c:d="1">{scene(body.format("more"))[8:]}',
@@ -154,13 +154,13 @@ def test_includes_of_one_name_in_several_folders_and_attached_models_are_read(
     )
     geom = '<body name="{0}"><geom name="{0}" size="1"/></body>'
     mesh = '<asset><mesh name="cube" file="cube.obj"/></asset>'
-    written(tmp_path / "sub", a=scene(geom.format("first"), '<include file="deep/a.xml"/>'))
-    written(tmp_path / "sub" / "deep", a=scene(geom.format("second")))
-    written(
+    write_files(tmp_path / "sub", a=scene(geom.format("first"), '<include file="deep/a.xml"/>'))
+    write_files(tmp_path / "sub" / "deep", a=scene(geom.format("second")))
+    write_files(
         tmp_path / "part",
         a=scene('<body name="p"><geom name="g" type="mesh" mesh="cube"/></body>', mesh),
     )
-    model = written(
+    model = write_files(
         tmp_path,
         a=scene(
             geom.format("own") + '<attach model="m" body="p" prefix="x_"/>',
@@ -181,13 +181,13 @@ def test_replicas_of_what_is_included_or_attached_count(tmp_path: Path) -> None:
     )
     included = scene(many.format('<include file="part.xml"/>'))
     for text in (attached, included):
-        assert PARTS in refusal(written(tmp_path, bad=text, part=inner))
+        assert PARTS in find_refusal(write_files(tmp_path, bad=text, part=inner))
 
 
 def test_a_count_of_parts_that_is_permitted_is_read_in_bounded_time(tmp_path: Path) -> None:
     # Infinite limits are none.
     joint = '<joint name="j" range="-inf inf" limited="false" actuatorfrcrange="-inf inf"/>'
     many = f'<replicate count="300" offset="1 0 0">{PART}</replicate>'
-    model = written(tmp_path, good=scene(f'{many}<body>{joint}<geom size="1"/></body>'))
+    model = write_files(tmp_path, good=scene(f'{many}<body>{joint}<geom size="1"/></body>'))
     compiled: mujoco.MjModel = compile_spec(load_spec(model), model)
     assert (compiled.ngeom, compiled.njnt) == (301, 301)

@@ -21,7 +21,7 @@ ROBOT, SCENE = config("puma560")
 
 
 @pytest.mark.parametrize("arm", ["puma560", "k1607"])
-def test_motors_put_in_no_more_than_a_part_of_the_energy_that_the_brakes_take_anyway(
+def test_motors_add_at_most_a_fraction_of_the_energy_that_the_brakes_absorb(
     arm: str,
 ) -> None:
     made = cell(arm)

@@ -25,61 +25,61 @@ class Sleepless(SimulatedArm):
     sleeps = False
 
 
-def arm_of(kind: type[SimulatedArm] = SimulatedArm) -> SimulatedArm:
+def build_arm(kind: type[SimulatedArm] = SimulatedArm) -> SimulatedArm:
     """Return an arm that stands still above a block that is pushed once."""
     _, scene = config("puma560")
     return kind(cell("puma560"), scene.model_copy(update={"push": (PUSH,)}), CLOCK_NS)
 
 
-def saved(arm: SimulatedArm) -> Message:
+def save_state(arm: SimulatedArm) -> Message:
     message = ArmState.zeros(sizes(arm.cell))
     arm.save(message)
     return message
 
 
-def state(arm: SimulatedArm) -> list[float]:
-    found: list[float] = saved(arm).state.tolist()
+def read_state(arm: SimulatedArm) -> list[float]:
+    found: list[float] = save_state(arm).state.tolist()
     return found
 
 
-def asleep(arm: SimulatedArm) -> list[bool]:
+def list_asleep(arm: SimulatedArm) -> list[bool]:
     """Return, by tree of bodies, the arm first, whether it sleeps."""
-    return [tree >= 0 for tree in state(arm)[-arm.cell.model.ntree :]]
+    return [tree >= 0 for tree in read_state(arm)[-arm.cell.model.ntree :]]
 
 
-def places(arm: SimulatedArm) -> np.ndarray:
+def read_places(arm: SimulatedArm) -> np.ndarray:
     rows = arm.cell.object_qpos[:, None] + np.arange(3)
     return np.array(arm._data.qpos[rows])
 
 
 def test_objects_sleep_until_one_is_pushed_and_end_where_they_would_without_sleep() -> None:
-    arm, other = arm_of(), arm_of(Sleepless)
-    start = places(arm)
-    assert asleep(arm) == [False] * 4
+    arm, other = build_arm(), build_arm(Sleepless)
+    start = read_places(arm)
+    assert list_asleep(arm) == [False] * 4
     arm.step(PUSHED_TICK)
-    assert asleep(arm) == [False, True, True, True]
+    assert list_asleep(arm) == [False, True, True, True]
     arm.step(1)
-    assert asleep(arm) == [False, False, True, True]
+    assert list_asleep(arm) == [False, False, True, True]
     arm.step(END_TICK - PUSHED_TICK - 1)
-    assert asleep(arm) == [False, True, True, True]
+    assert list_asleep(arm) == [False, True, True, True]
     other.step(END_TICK)
-    assert asleep(other) == [False] * 4
-    assert np.abs(places(arm) - start).max() > 0.08
-    assert places(arm) == pytest.approx(places(other), abs=0.005)
+    assert list_asleep(other) == [False] * 4
+    assert np.abs(read_places(arm) - start).max() > 0.08
+    assert read_places(arm) == pytest.approx(read_places(other), abs=0.005)
 
 
 @pytest.mark.parametrize("tick", [FALLING_ASLEEP_TICK, 100, PUSHED_TICK + 5, END_TICK - 60])
 def test_a_restored_cell_continues_bit_for_bit_asleep_or_awake(
     tick: int,
 ) -> None:
-    arm, again = arm_of(), arm_of()
+    arm, again = build_arm(), build_arm()
     arm.step(tick)
     again.step(PUSHED_TICK + 3)  # where others are awake
-    again.restore(saved(arm))
-    assert state(again) == state(arm)
+    again.restore(save_state(arm))
+    assert read_state(again) == read_state(arm)
     for each in (arm, again):
         each.step(END_TICK - tick)
-    assert state(again) == state(arm)
+    assert read_state(again) == read_state(arm)
 
 
 def test_nothing_sleeps_where_an_obstacle_moves() -> None:
@@ -94,7 +94,7 @@ def test_nothing_sleeps_where_an_obstacle_moves() -> None:
     assert not made.model.opt.enableflags & SLEEP
 
 
-def test_nothing_sleeps_in_a_model_that_mujoco_would_end_the_process_for() -> None:
+def test_nothing_sleeps_in_a_model_for_which_mujoco_would_end_the_process() -> None:
     tied = mujoco.MjModel.from_xml_string("""
         <mujoco><worldbody>
           <body><joint name="a"/><geom size=".1"/></body>

@@ -15,21 +15,21 @@ from tests.levels.systems.force.pad import pad
 CLOCK_NS = 1_000_000
 
 
-def test_range_limits_and_noise_are_those_of_model_and_config(tmp_path: Path) -> None:
+def test_range_limits_and_noise_come_from_model_and_config(tmp_path: Path) -> None:
     wrist = build_cell(*pad(tmp_path, noise=0.3), CLOCK_NS).wrist
     assert wrist is not None
     assert (wrist.range, wrist.most, wrist.noise) == ((150.0, 20.0), (60.0, 8.0), (0.3, 0.03))
     assert np.array_equal(wrist.addresses, np.arange(6))
 
 
-def test_what_hangs_on_the_sensor_may_touch_supports_and_nothing_else(tmp_path: Path) -> None:
+def test_bodies_beyond_the_sensor_may_touch_supports_only(tmp_path: Path) -> None:
     model = (cell := build_cell(*pad(tmp_path), CLOCK_NS)).model
     tip, flange, table, floor = (
         model.geom(name).id for name in ("pad", "flange", "table", "pedestal")
     )
-    assert not cell.touch[tip, table]
-    assert cell.touch[tip, floor]
-    assert cell.touch[flange, table]
+    assert not cell.geoms.touch[tip, table]
+    assert cell.geoms.touch[tip, floor]
+    assert cell.geoms.touch[flange, table]
 
 
 @pytest.mark.parametrize(
@@ -45,15 +45,15 @@ def test_what_hangs_on_the_sensor_may_touch_supports_and_nothing_else(tmp_path: 
         (
             {"torque": "wrist_force"},
             (
-                "robot.wrist.torque: sensor 'wrist_force' is no torque sensor; it has these torque"
-                " sensors: wrist_torque"
+                "robot.wrist.torque: sensor 'wrist_force' is not a torque sensor; it has these"
+                " torque sensors: wrist_torque"
             ),
         ),
         (
             {"sites": ("sensor", "tcp")},
             (
-                "robot.wrist: force and torque are sensed at two sites, 'sensor' and 'tcp'; one is"
-                " valid"
+                "robot.wrist: force and torque are sensed at two sites, 'sensor' and 'tcp',"
+                " instead of one"
             ),
         ),
         (
@@ -62,15 +62,15 @@ def test_what_hangs_on_the_sensor_may_touch_supports_and_nothing_else(tmp_path: 
         ),
         (
             {"reach": 0.0},
-            "robot.wrist.force: sensor 'wrist_force' has no range; give it a cutoff, N",
+            "robot.wrist.force: sensor 'wrist_force' has no range; set its cutoff, N",
         ),
         (
             {"most_force": 151.0},
-            "robot.wrist.most_force: 151 N is beyond the sensor's range; at most 150 is valid",
+            "robot.wrist.most_force: 151 N is beyond the sensor's range; it must be at most 150",
         ),
         (
             {"most_torque": 25.0},
-            "robot.wrist.most_torque: 25 N m is beyond the sensor's range; at most 20 is valid",
+            "robot.wrist.most_torque: 25 N m is beyond the sensor's range; it must be at most 20",
         ),
     ],
 )

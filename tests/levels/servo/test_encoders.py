@@ -85,7 +85,7 @@ def test_the_tolerance_follows_from_the_encoders(tmp_path: Path) -> None:
     exact = tolerance(cell)
     with pytest.raises(
         RobotError,
-        match=r"robot.sensors.noise: 3 values; permitted: one for all joints, or 2, one per joint",
+        match=r"robot.sensors.noise: has 3 values but needs one for all joints, or one per joint",
     ):
         build_cell(
             pendulum(tmp_path, sensors=SensorConfig(noise=(0.1, 0.1, 0.1))), SceneConfig(), CLOCK_NS

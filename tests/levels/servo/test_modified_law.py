@@ -281,7 +281,10 @@ MISTAKES = {
         {"class": "rack.levels.servo:ServoExecutor"},
         "has no Modification named 'ServoExecutor'",
     ),
-    "half a class": ({"class": HERE + "Unfinished"}, "class 'Unfinished' lacks: modify"),
+    "half a class": (
+        {"class": HERE + "Unfinished"},
+        "class 'Unfinished' does not implement: modify",
+    ),
     "no hook": (
         {"class": HERE + "Hookless"},
         "class 'Hookless' has the hook None; must be one of before, instead, after",

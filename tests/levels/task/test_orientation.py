@@ -70,7 +70,7 @@ FIVE = """
 SCENE = SceneConfig(objects=("can",), supports=("table",))
 
 
-def five(folder: Path, x: float = 0.25, bend: float = 2.0) -> RobotConfig:
+def write_five_joint_arm(folder: Path, x: float = 0.25, bend: float = 2.0) -> RobotConfig:
     """Write an arm of five joints with a can at `x`, m, on its table; return its config."""
     model = folder / "five.xml"
     model.write_text(FIVE.format(x=x, bend=bend))
@@ -100,7 +100,7 @@ def transfer(to: list[float]) -> dict[str, Any]:
 
 @pytest.mark.slow
 def test_a_refusal_says_when_another_orientation_would_reach(tmp_path: Path) -> None:
-    start = rehearsal(five(tmp_path))
+    start = rehearsal(write_five_joint_arm(tmp_path))
     with pytest.raises(Refused, match="in reach in another orientation"):
         goto(start, 0, Goto(position=(0.45, 0.0, 0.25)))
     with pytest.raises(Refused) as refused:
@@ -108,8 +108,8 @@ def test_a_refusal_says_when_another_orientation_would_reach(tmp_path: Path) -> 
     assert "orientation" not in str(refused.value)
 
 
-def test_a_goto_in_any_direction_brings_five_joints_to_the_place(tmp_path: Path) -> None:
-    start = rehearsal(five(tmp_path))
+def test_a_goto_in_any_direction_reaches_the_place_with_five_joints(tmp_path: Path) -> None:
+    start = rehearsal(write_five_joint_arm(tmp_path))
     place = (0.40, 0.1, 0.25)
     end = goto(start, 0, Goto(position=place, direction="any"))
     assert end.motion.ik.tool_at(end.q).position == pytest.approx(place, abs=1e-4)
@@ -117,7 +117,7 @@ def test_a_goto_in_any_direction_brings_five_joints_to_the_place(tmp_path: Path)
         goto(start, 0, Goto(position=(0.9, 0.0, 0.2), direction="any"))
 
 
-def leaning_of(end: Rehearsal) -> float:
+def compute_lean(end: Rehearsal) -> float:
     """Return how far from straight down the tool grasps, rad."""
     tool = next(move.tool for move, _ in end.moves if move.object is not None)
     down = np.zeros(3)
@@ -131,22 +131,22 @@ def leaning_of(end: Rehearsal) -> float:
 def test_a_grasp_leans_where_it_cannot_be_straight_down(
     tmp_path: Path, bend: float, lean: float
 ) -> None:
-    start = rehearsal(five(tmp_path, bend=bend))
+    start = rehearsal(write_five_joint_arm(tmp_path, bend=bend))
     program = TaskConfig(action=[transfer([0.18, 0.15, 0.05])])
-    assert leaning_of(rehearse(program, SCENE, start)) == pytest.approx(lean, abs=1e-4)
+    assert compute_lean(rehearse(program, SCENE, start)) == pytest.approx(lean, abs=1e-4)
 
 
 @pytest.mark.slow
 def test_five_joints_transfer_a_can(tmp_path: Path) -> None:
     to = [0.18, 0.15, 0.05]
-    rack = WholeRack(arm=(five(tmp_path, bend=0.9), SCENE), actions=[transfer(to)])
+    rack = WholeRack(arm=(write_five_joint_arm(tmp_path, bend=0.9), SCENE), actions=[transfer(to)])
     status = rack.run_to_end(25.0)
     assert status.state == State.DONE, status.reason
     assert rack.read("servo.status").touches == 0
     assert rack.read("world.model").position[0] == pytest.approx(to, abs=0.01)
 
 
-def moved(
+def rehearse_move(
     to: tuple[float, float, float], cell: tuple[RobotConfig, SceneConfig] | None = None
 ) -> Rehearsal:
     """Return the rehearsal of the PUMA's block1 moved to `to`, m."""
@@ -163,5 +163,5 @@ def test_a_place_behind_the_wall_is_refused_with_the_reason() -> None:
         Refused,
         match=r"place block1 at \[0.62, 0, 0.475\]: 'forearm' and 'wall' are -\d+.\d mm apart",
     ) as refused:
-        moved((0.62, 0.0, 0.475))
+        rehearse_move((0.62, 0.0, 0.475))
     assert refused.value.code == Error.NO_PATH

@@ -49,20 +49,20 @@ def start() -> Rehearsal:
     return Rehearsal(MotionPlanner(puma, SCENE, 1990), puma.home, situation)
 
 
-def rehearsed(start: Rehearsal, *actions: Mapping[str, Any]) -> Rehearsal:
+def rehearse_actions(start: Rehearsal, *actions: Mapping[str, Any]) -> Rehearsal:
     return rehearse(read_program({"action": list(actions)}, ROBOT, SCENE), SCENE, start)
 
 
-def refusal(start: Rehearsal, action: Mapping[str, Any]) -> Refused:
+def find_refusal(start: Rehearsal, action: Mapping[str, Any]) -> Refused:
     with pytest.raises(Refused) as caught:
-        rehearsed(start, action)
+        rehearse_actions(start, action)
     assert caught.value.action == 0
     assert len(f"action 0, {caught.value}") <= REASON_BYTES
     return caught.value
 
 
 def test_transfer_is_eight_moves_and_leaves_the_object_at_its_goal(start: Rehearsal) -> None:
-    end = rehearsed(start, {**TRANSFER, "yaw": 0.6})
+    end = rehearse_actions(start, {**TRANSFER, "yaw": 0.6})
     assert start.moves == ()
     assert start.situation.object_pose(BLOCK1).position == pytest.approx([0.5, 0.3, 0.475])
     verbs = [r.move.verb for r in end.moves]
@@ -110,19 +110,19 @@ def test_transfer_is_eight_moves_and_leaves_the_object_at_its_goal(start: Rehear
         ),
     ],
 )
-def test_what_cannot_be_done_is_refused_with_what_can(
+def test_an_impossible_action_is_refused_with_a_possible_alternative(
     start: Rehearsal, action: Mapping[str, Any], code: Error, words: str
 ) -> None:
-    refused = refusal(start, action)
+    refused = find_refusal(start, action)
     assert refused.code == code
     assert words in str(refused)
     if "; in reach: [" in str(refused):
         place = str(refused).partition("in reach: [")[2].partition("]")[0].split(",")
-        assert rehearsed(start, {"do": "goto", "position": [float(x) for x in place]}).moves
+        assert rehearse_actions(start, {"do": "goto", "position": [float(x) for x in place]}).moves
 
 
-def test_move_with_a_time_ends_no_sooner_and_holds_up_what_follows(start: Rehearsal) -> None:
-    first, second = rehearsed(start, REACH, HOME).moves
+def test_a_move_with_a_deadline_ends_no_sooner_and_delays_later_moves(start: Rehearsal) -> None:
+    first, second = rehearse_actions(start, REACH, HOME).moves
     late = Rehearsed(first.move._replace(by_s=50.0), first.duration_s)
     times = finish_times([late, second], 4.0, CONTEXT, TaskParams())
     assert times[0] == pytest.approx(51.0)
@@ -137,7 +137,7 @@ def refused_run() -> WholeRack:
 
 
 @pytest.mark.slow
-def test_time_that_cannot_be_met_is_refused_at_once_with_the_earliest(
+def test_an_impossible_deadline_is_refused_at_once_with_the_earliest_time(
     refused_run: WholeRack,
 ) -> None:
     status = refused_run.task
@@ -149,7 +149,7 @@ def test_time_that_cannot_be_met_is_refused_at_once_with_the_earliest(
     assert refused_run.read("servo.status").position == pytest.approx(ROBOT.home, abs=1e-3)
 
 
-def test_time_of_another_rack_is_not_refused_for_the_rounding_of_its_offset() -> None:
+def test_a_deadline_on_another_racks_clock_is_not_refused_because_of_rounding() -> None:
     rack = WholeRack(actions=[{**HOME, "by": 20.0}])
     planner = rack.tasks["task.planner"].level
     assert isinstance(planner, TaskPlanner)

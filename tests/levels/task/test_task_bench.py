@@ -64,7 +64,7 @@ class Bench(Lockstep):
         return [int(serial) for serial in command.moves["id"][: command.count]]
 
 
-def test_window_moves_with_what_is_done_and_ends_with_the_plan() -> None:
+def test_the_window_moves_with_completed_moves_and_ends_with_the_plan() -> None:
     bench, moves = Bench(HOME, HOME), 2 * WINDOW
     bench.plan([0] * WINDOW + [1] * WINDOW)
     assert bench.window() == list(range(1, WINDOW + 1))
@@ -79,7 +79,7 @@ def test_window_moves_with_what_is_done_and_ends_with_the_plan() -> None:
     assert bench.status.action == bench.status.actions == 2
 
 
-def test_refused_plan_hands_nothing_down() -> None:
+def test_no_moves_of_a_refused_plan_are_handed_down() -> None:
     bench = Bench(HOME)
     bench.plan([], error=Error.UNREACHABLE)
     assert bench.window() == []
@@ -90,7 +90,7 @@ def test_refused_plan_hands_nothing_down() -> None:
     assert bench.status.state == State.IDLE
 
 
-def test_action_that_is_late_is_an_error() -> None:
+def test_a_late_action_is_an_error() -> None:
     bench = Bench({**HOME, "by": 5.0})
     bench.plan([0])
     bench.cycle()
@@ -118,7 +118,7 @@ HELD = {"state": State.HOLDING, "reason": "waiting for servo: brakes engaged"}
         ),
     ],
 )
-def test_task_that_stands_still_ends_and_says_why(
+def test_a_stalled_task_ends_with_the_reason(
     plan: list[int], below: dict[str, Any], why: str
 ) -> None:
     bench = Bench(HOME, stalled_s=5.0)
@@ -182,7 +182,7 @@ class PlannedBench(Lockstep):
     [(True, 40, 1), (True, 900, 1), (False, 40, 1)],
     ids=["plan on its way", "plan followed", "plan never made"],
 )
-def test_planner_that_is_lost_plans_again_only_what_was_lost(
+def test_a_restarted_planner_plans_only_a_lost_plan_again(
     finished: bool, away_ticks: int, published: int
 ) -> None:
     bench = PlannedBench(HOME)

@@ -16,11 +16,11 @@ PUMA, SCENE = config("puma560")
 NASREM = load("nasrem")
 
 
-def read(*actions: dict[str, Any]) -> TaskConfig:
+def read_actions(*actions: dict[str, Any]) -> TaskConfig:
     return read_program({"action": list(actions)}, PUMA, SCENE)
 
 
-def mistake(*actions: dict[str, Any]) -> str:
+def find_mistakes(*actions: dict[str, Any]) -> str:
     """Return all mistakes of a program, as the check of a config reports them."""
     with pytest.raises(ConfigError) as caught:
         resolve(NASREM.model_copy(update={"task": {"action": list(actions)}}))
@@ -28,7 +28,7 @@ def mistake(*actions: dict[str, Any]) -> str:
 
 
 def test_actions_of_every_kind_are_read() -> None:
-    transfer, pose, joints, home = read(
+    transfer, pose, joints, home = read_actions(
         {"do": "transfer", "object": "peg", "to": [0.5, 0.3, 0.5], "yaw": 1.0, "by": 30},
         {"do": "goto", "position": [0.5, 0.2, 0.7], "direction": [0, 0, -1]},
         {"do": "goto", "joints": [0, 0, 0, 0, 0, 0]},
@@ -55,7 +55,7 @@ def test_actions_of_every_kind_are_read() -> None:
         ),
         (
             {"do": "transfer", "object": "peg"},
-            "task.action[0].to: missing; where the object's origin goes, m",
+            "task.action[0].to: missing; final position of the object's origin, m",
         ),
         (
             {"do": "home", "by": 0},
@@ -68,11 +68,11 @@ def test_actions_of_every_kind_are_read() -> None:
         ({"do": "goto"}, "task.action[0]: a goto has either position or joints"),
         (
             {"do": "goto", "joints": [0, 0]},
-            "task.action[0].joints = [0.0, 0.0]: 2 values; permitted: 6, one per joint",
+            "task.action[0].joints = [0.0, 0.0]: has 2 values but needs 6, one per joint",
         ),
         (
             {"do": "goto", "position": [0, 0, 1], "direction": [0, 0, 0]},
-            "task.action[0]: direction is all zero; its length must not be zero",
+            "task.action[0]: direction is zero; its length must not be zero",
         ),
         (
             {"do": "goto", "position": [0, 0, float("nan")]},
@@ -83,12 +83,12 @@ def test_actions_of_every_kind_are_read() -> None:
 def test_each_mistake_is_one_line_with_place_value_and_what_is_valid(
     action: dict[str, Any], line: str
 ) -> None:
-    assert mistake(action) == line
+    assert find_mistakes(action) == line
 
 
-def test_transfer_needs_a_gripper() -> None:
+def test_a_transfer_needs_a_gripper() -> None:
     robot, scene = config("k1607")
-    with pytest.raises(ProgramError, match="the robot has no gripper; permitted: goto, home"):
+    with pytest.raises(ProgramError, match="the robot has no gripper; valid actions: goto, home"):
         read_program(
             {"action": [{"do": "transfer", "object": "peg", "to": [0, 0, 0]}]}, robot, scene
         )

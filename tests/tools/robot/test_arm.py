@@ -112,7 +112,7 @@ def test_an_arm_of_too_many_joints_is_refused_with_what_to_do(tmp_path: Path) ->
         inner = rod(f"snake{number}", inner, spring='range="-1 1"')
     motors = "".join(f'<motor joint="snake{k}" ctrlrange="-9 9"/>' for k in range(1, 13))
     text = with_tool("flange", inner).replace("</actuator>", f"{motors}</actuator>")
-    with pytest.raises(RobotError, match=r"at most 16 joints, and not 18: waist, .* --tip"):
+    with pytest.raises(RobotError, match=r"at most 16 joints, not 18: waist, .* --tip"):
         found(tmp_path, text)
 
 

@@ -72,5 +72,5 @@ def test_a_gripper_that_its_own_arm_keeps_from_closing_is_held(tmp_path: Path) -
     model.write_text(model.read_text().replace('<body name="link6"', f'{stop}<body name="link6"'))
     made = drafted(tmp_path, robot.model)
     assert made.robot.gripper is None
-    assert made.notes[-1].startswith("no gripper: robot.gripper.force: 2.918 does not bring")
+    assert made.notes[-1].startswith("no gripper: robot.gripper.force: 2.918 does not move")
     build_cell(made.robot, NOTHING, CLOCK_NS)

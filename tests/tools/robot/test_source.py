@@ -29,7 +29,7 @@ def refusal(folder: Path, text: str) -> str:
     return str(refused.value)
 
 
-VELOCITY = "valid: a finite number, such as 2.5, from 0 to 1e+09"
+VELOCITY = "it must be a finite number, such as 2.5, from 0 to 1e+09"
 NUMBERS = {
     "comma": ('velocity="2"', 'velocity="2,5"', f"velocity = '2,5'; {VELOCITY}"),
     "empty": ('velocity="2"', 'velocity=""', f"velocity = ''; {VELOCITY}"),
@@ -42,7 +42,7 @@ NUMBERS = {
     "effort": ('effort="60.0"', 'effort="60 N"', "<limit> of joint 'j1': effort = '60 N'"),
     "mass": ('mass value="1.0"', 'mass value="nan"', "<mass> of link 'base': value = 'nan'"),
     "inertia": ('ixx="0.01"', 'ixx="inf"', "<inertia> of link 'base': ixx = 'inf'"),
-    "place": ('xyz="0 0 0.05"', 'xyz="0 0"', "xyz = '0 0'; valid: 3 finite numbers"),
+    "place": ('xyz="0 0 0.05"', 'xyz="0 0"', "xyz = '0 0'; it must be 3 finite numbers"),
     "axis": ('axis xyz="0 0 1"', 'axis xyz="z"', "<axis> of joint 'j1': xyz = 'z'"),
     "size": ('size="0.1 0.1 0.1"', 'size="0,1 0,1 0,1"', "<box> of link 'base': size = '0,1"),
     "friction": ("<axis", '<dynamics friction=""/><axis', "of joint 'j1': friction = ''"),

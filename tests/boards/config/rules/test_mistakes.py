@@ -109,7 +109,7 @@ MISTAKES = {
     ),
     "no method": (
         "board.upper.executor='two_levels:Unfinished'",
-        "class 'Unfinished' lacks: process",
+        "class 'Unfinished' does not implement: process",
     ),
     "nobody writes": (
         "board.upper.reads={ below = 'lower.state' }",
@@ -227,7 +227,7 @@ def test_an_encoder_is_described_for_all_joints_or_for_each() -> None:
     resolve(load("nasrem", [f"robot.sensors.resolution={six}"]))
     (mistake,) = mistakes("nasrem", "robot.sensors.resolution=[1e-4, 1e-4]")
     assert mistake.place == "robot.sensors.resolution"
-    assert mistake.why == "2 values; permitted: one for all joints, or 6, one per joint"
+    assert mistake.why == "has 2 values but needs one for all joints, or one per joint: 6"
 
 
 def test_lists_of_another_length_than_the_joints_are_reported_together() -> None:
@@ -283,7 +283,7 @@ PARAMS = {
     "of the planner alone": (
         "nasrem",
         "task.params.settling=-1",
-        "= -1: should be greater than 0; from the end",
+        "= -1: should be greater than 0; longest time from the end",
     ),
 }
 
