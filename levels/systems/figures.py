@@ -21,7 +21,7 @@ class FigurePlan(Message, version=1):
 
     made_at: int = field(unit="tick", doc="release that the plan answers")
     cycle: int = field(
-        unit="tick", doc="cycle of the executor whose status the plan rests on; -1: none was there"
+        unit="tick", doc="cycle of the executor whose status the plan is based on (-1: none)"
     )
 
 
@@ -30,7 +30,7 @@ class FigureStatus(Status, version=1):
 
     cycle: int = field(unit="tick", doc="release of this cycle")
     plan: int = field(
-        unit="tick", doc="release that the plan in force answers; -1: there is none yet"
+        unit="tick", doc="release that the current plan answers (-1: no plan yet)"
     )
 
 

@@ -43,7 +43,7 @@ class OrderedTaskParams(TaskParams):
     """Source of the orders of a task level, and how long it keeps a promise."""
 
     coordinator: RackName = ""
-    """rack that gives the orders over the network; empty: a board of this rack gives them"""
+    """rack that gives the orders over the network, empty if a board of this rack does"""
     orders: MailboxName = "lan.orders"
     """mailbox with the orders"""
     decision: Positive = 5.0

@@ -43,9 +43,9 @@ STILL_M_S = 0.005
 class MoveTableStatus(TableStatus, version=1):
     """Status of the elemental move level of state tables."""
 
-    sent: int = integer("serial of the newest command sent down; 0: none")
+    sent: int = integer("serial of the newest command sent down (0: none)")
     reached: bool = field(doc="1: the newest pose has joint positions")
-    put: int = integer("row of the object put down last; -1: none", "i2")
+    put: int = integer("row of the object put down last (-1: none)", "i2")
     resting: bool = field(doc="1: the arm rests")
 
 

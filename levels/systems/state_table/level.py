@@ -72,13 +72,13 @@ class TableStatus(AnsweringStatus, version=1):
     table: str = field(f"S{NAME_BYTES}", doc="state table in force")
     checksum: int = integer("CRC-32 of its file")
     in_state: str = field(f"S{NAME_BYTES}", doc="state after this cycle")
-    row: int = integer("row that fired in this cycle, from 1; 0: none", "u2")
+    row: int = integer("row that fired in this cycle, counted from 1 (0: none)", "u2")
     fired: str = field(f"S{ROW_NAME_BYTES}", doc="its name")
-    words: str = field(f"S{PHRASE_BYTES}", doc="command in force; empty: none")
+    words: str = field(f"S{PHRASE_BYTES}", doc="command in force (empty: none)")
     ordered: int = integer(
-        "serial of an operator's command, if it is in force; 0: it is the level above's"
+        "serial of the operator's command in force (0: the level above commands)"
     )
-    done: int = integer("newest command of the level above that is done; 0: none")
+    done: int = integer("newest completed command of the level above (0: none)")
 
 
 YES_NO = ("no", "yes")

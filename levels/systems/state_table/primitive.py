@@ -54,7 +54,7 @@ class JointMove(TableCommand, version=1):
 
     joints: np.ndarray = per_joint("rad", "where a motion ends")
     speed: float = field(unit="1", doc="part of the joints' limits")
-    object: int = integer("row of the object concerned in the world model; -1: none", "i2")
+    object: int = integer("row of the object in the world model (-1: none)", "i2")
     aim: np.ndarray = field(
         unit="m", doc="where the object, or the place, was for this command", shape=3
     )
@@ -69,7 +69,7 @@ class JointMoveStatus(TableStatus, version=1):
     moving: bool = field(doc="1: they still change")
     closed: bool = field(doc="1: the gripper is commanded to close")
     held: bool = field(doc="1: it holds something")
-    object: int = integer("row of the object that it holds; -1: none", "i2")
+    object: int = integer("row of the object in the gripper (-1: none)", "i2")
 
 
 class PrimitivePlanConfig(Table):

@@ -38,7 +38,7 @@ class TaskTableStatus(TableStatus, version=1):
     actions: int = integer("steps of the plan", "u2")
     moves_done: int = integer("commands done by the level below", "u2")
     moves: int = integer("commands of the plan", "u2")
-    sent: int = integer("serial of the newest command sent down; 0: none")
+    sent: int = integer("serial of the newest command sent down (0: none)")
 
 
 class StepConfig(Table):

@@ -65,22 +65,22 @@ class MotionRequest(RelayedCommand, version=1):
         unit="1", doc="goal of POSE: tool orientation, in the frame of `body`", shape=4
     )
     body: int = integer(
-        "row of the body in the world model in whose frame the goal is; -1: the world", "i2"
+        "row of the body whose frame the goal refers to (-1: the world)", "i2"
     )
     live: bool = field(
-        doc="1: the goal follows the body; 0: its frame is copied when the request begins"
+        doc="1 if the goal follows the body, 0 if the frame is fixed at the start of the request"
     )
     acceleration: float = field(
-        unit="s", doc="half the time of the blend into this request; 0: the level's default"
+        unit="s", doc="half the blend time into this request (0: default of the level)"
     )
     segment: float = field(
-        unit="s", doc="time for the request; 0: from the speed limits; too short: stretched"
+        unit="s", doc="time for the request, stretched if it is too short (0: set by the speed limits)"
     )
     opening: float = field(unit="m", doc="gripper joint position to go to, for GRIP")
     force: float = field(unit="N", doc="largest gripper force, for GRIP")
     touch: float = field(
         unit="N m",
-        doc="lasting change of any joint's torque at which POSE ends GUARDED; 0: no guard",
+        doc="lasting change of a joint torque at which POSE ends GUARDED (0: no guard)",
     )
 
 
@@ -103,11 +103,11 @@ class MotionState(Message, version=1):
 class MotionStatus(AnsweringStatus, version=1):
     """Status of a trajectory level."""
 
-    taken: int = integer("newest request taken from the queue; 0: none yet")
-    current: int = integer("request under way; 0: none")
-    done: int = integer("newest request ended, however; 0: none yet")
+    taken: int = integer("newest request taken from the queue (0: none yet)")
+    current: int = integer("request being carried out (0: none)")
+    done: int = integer("newest request that ended in any way (0: none yet)")
     ended: ndarray = field(
-        "u4", unit="1", doc="ids of the last requests ended, newest first; 0: none", shape=ENDED
+        "u4", unit="1", doc="ids of the requests that ended last, newest first (0: none)", shape=ENDED
     )
     ends: ndarray = field("u1", unit=RequestEnd, doc="how they ended", shape=ENDED)
     progress: float = field(
@@ -118,5 +118,5 @@ class MotionStatus(AnsweringStatus, version=1):
     velocity: ndarray = per_joint("rad/s", "joint velocities commanded last")
     tool: ndarray = field(unit="m", doc="tool position commanded last", shape=3)
     astray: float = field(
-        unit="m", doc="distance of that from a live goal, once reached; 0: there is none"
+        unit="m", doc="its distance from a live goal that was reached (0: no live goal)"
     )
