@@ -29,9 +29,7 @@ class FigureStatus(Status, version=1):
     """Status of the level of the paper's Gantt charts."""
 
     cycle: int = field(unit="tick", doc="release of this cycle")
-    plan: int = field(
-        unit="tick", doc="release that the current plan answers (-1: no plan yet)"
-    )
+    plan: int = field(unit="tick", doc="release that the current plan answers (-1: no plan yet)")
 
 
 NS_PER_MS = 1e6

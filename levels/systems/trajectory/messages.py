@@ -64,9 +64,7 @@ class MotionRequest(RelayedCommand, version=1):
     quaternion: ndarray = field(
         unit="1", doc="goal of POSE: tool orientation, in the frame of `body`", shape=4
     )
-    body: int = integer(
-        "row of the body whose frame the goal refers to (-1: the world)", "i2"
-    )
+    body: int = integer("row of the body whose frame the goal refers to (-1: the world)", "i2")
     live: bool = field(
         doc="1 if the goal follows the body, 0 if the frame is fixed at the start of the request"
     )
@@ -74,7 +72,7 @@ class MotionRequest(RelayedCommand, version=1):
         unit="s", doc="half the blend time into this request (0: default of the level)"
     )
     segment: float = field(
-        unit="s", doc="time for the request, stretched if it is too short (0: set by the speed limits)"
+        unit="s", doc="time for the request, stretched if too short (0: set by speed limits)"
     )
     opening: float = field(unit="m", doc="gripper joint position to go to, for GRIP")
     force: float = field(unit="N", doc="largest gripper force, for GRIP")
@@ -107,7 +105,7 @@ class MotionStatus(AnsweringStatus, version=1):
     current: int = integer("request being carried out (0: none)")
     done: int = integer("newest request that ended in any way (0: none yet)")
     ended: ndarray = field(
-        "u4", unit="1", doc="ids of the requests that ended last, newest first (0: none)", shape=ENDED
+        "u4", unit="1", doc="ids of the last requests to end, newest first (0: none)", shape=ENDED
     )
     ends: ndarray = field("u1", unit=RequestEnd, doc="how they ended", shape=ENDED)
     progress: float = field(
