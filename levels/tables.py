@@ -61,7 +61,8 @@ class Table(BaseModel):
     """Base of every config table: unknown keys are errors, values are frozen, `true` does not pass
     for 1.
 
-    A text below a field is its description: see `keys_of`.
+    A text below a field is its description, with the unit in brackets: "velocity limits [rad/s]".
+    See `keys_of`.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
@@ -169,16 +170,16 @@ class SensorConfig(Table):
     """
 
     resolution: NotNegative | tuple[NotNegative, ...] = 0.0
-    """step of a joint position as sensed, rad"""
+    """step of a joint position as sensed [rad]"""
     noise: NotNegative | tuple[NotNegative, ...] = 0.0
-    """standard deviation of a joint position as sensed, rad"""
+    """standard deviation of a joint position as sensed [rad]"""
 
 
 class CalibrationConfig(Table):
     """`[robot.calibration]`: how the drives' samples become positions of the joints."""
 
     offset: tuple[Finite, ...] | None = None
-    """added to every position that the drives give, rad; default: nothing"""
+    """added to every position that the drives give [rad]; default: nothing"""
     homing: bool = False
     """the drives find their reference while they are being enabled, and know no position before
     that"""
@@ -209,20 +210,20 @@ class GripperConfig(Table):
     joint: str
     """MJCF joint whose position is the opening"""
     open: Finite
-    """joint position when open, m or rad"""
+    """joint position when open [m or rad]"""
     closed: Finite
-    """joint position when closed on nothing, m or rad"""
+    """joint position when closed on nothing [m or rad]"""
     force: Positive
-    """largest force or torque of the actuator, N or N m"""
+    """largest force or torque of the actuator [N or N m]"""
     stiffness: Positive | None = None
-    """position loop, N/m or N m/rad; default: all of the force at half of the way to closed"""
+    """position loop [N/m or N m/rad]; default: all of the force at half of the way to closed"""
     damping: Positive | None = None
-    """position loop, N s/m or N m s/rad; default: 30 ms times the stiffness"""
+    """position loop [N s/m or N m s/rad]; default: 30 ms times the stiffness"""
     follow: tuple[FollowConfig, ...] = ()
     """joints that follow the driven one, where the model does not say so"""
     residual: Positive = 0.012
     """how far fingers may settle from where planning poses them, because soft couplings yield, or a
-    loop may stay open, m; by default less than the 15 mm that planned motion keeps from
+    loop may stay open [m]; by default less than the 15 mm that planned motion keeps from
     everything"""
 
     @model_validator(mode="after")
@@ -254,15 +255,15 @@ class WristConfig(Table):
     """
 
     force: str
-    """MJCF force sensor; its cutoff is its range, N"""
+    """MJCF force sensor; its cutoff is its range [N]"""
     torque: str
-    """MJCF torque sensor at the same site; its cutoff is its range, N m"""
+    """MJCF torque sensor at the same site; its cutoff is its range [N m]"""
     most_force: Positive
-    """force of a contact at which the arm stops, N; within the range"""
+    """force of a contact at which the arm stops [N]; within the range"""
     most_torque: Positive
-    """torque of a contact at which the arm stops, N m; within the range"""
+    """torque of a contact at which the arm stops [N m]; within the range"""
     noise: NotNegative = 0.0
-    """standard deviation of a force as sensed, N; of a torque a tenth, N m"""
+    """standard deviation of a force as sensed [N]; of a torque a tenth, N m"""
 
 
 class FingerConfig(Table):
@@ -288,11 +289,11 @@ class HandConfig(Table):
     extensors: tuple[str, ...]
     """MJCF actuators on the tendons that turn it back"""
     least: Positive
-    """tension below which a tendon is slack, N"""
+    """tension below which a tendon is slack [N]"""
     rest: Positive
-    """mean tension of a pair at rest, N; it stiffens nothing in a linear tendon"""
+    """mean tension of a pair at rest [N]; it stiffens nothing in a linear tendon"""
     closed: NotNegative = 0.0
-    """stiffness of a tendon whose valve is closed, by the air in it, N/m; 0: it keeps its
+    """stiffness of a tendon whose valve is closed, by the air in it [N/m]; 0: it keeps its
     tension"""
 
 
@@ -300,7 +301,7 @@ class ToolConfig(Table):
     """`[robot.tool_offset]`: the tool's frame on a body, for a model without a site for it."""
 
     position: Vector = (0.0, 0.0, 0.0)
-    """of the tool in the body's frame, m"""
+    """of the tool in the body's frame [m]"""
     quaternion: tuple[Finite, Finite, Finite, Finite] = (1.0, 0.0, 0.0, 0.0)
     """of the tool in the body's frame, as w, x, y, z; its z axis approaches"""
 
@@ -321,20 +322,20 @@ class RobotConfig(Table):
     tool_offset: ToolConfig | None = None
     """pose of the tool on the body that `tool` names; default: the body's own"""
     home: tuple[Finite, ...] = Field((), min_length=1)
-    """joint positions to which tasks return, and the simulated start, rad; default: those of the
+    """joint positions to which tasks return, and the simulated start [rad]; default: those of the
     first keyframe"""
     start: tuple[Finite, ...] | None = None
-    """where the simulated arm starts, rad; default: home"""
+    """where the simulated arm starts [rad]; default: home"""
     velocity: tuple[Positive, ...]
-    """velocity limits, rad/s"""
+    """velocity limits [rad/s]"""
     acceleration: tuple[Positive, ...]
-    """acceleration limits of planned motion, rad/s2"""
+    """acceleration limits of planned motion [rad/s2]"""
     jerk: tuple[Positive, ...]
-    """jerk limits of planned motion, rad/s3"""
+    """jerk limits of planned motion [rad/s3]"""
     torque: tuple[Positive, ...] | None = None
-    """torque limits, N m; default: the model's actuator limits"""
+    """torque limits [N m]; default: the model's actuator limits"""
     position: tuple[tuple[Finite, Finite], ...] | None = None
-    """position limits, rad; default: the model's joint ranges"""
+    """position limits [rad]; default: the model's joint ranges"""
     interface: Interface = "torque"
     """what the drives take in every cycle: torques, or set points of position or velocity, which
     they follow by loops of their own; the simulated arm's drives are such, too"""
@@ -348,20 +349,20 @@ class RobotConfig(Table):
     calibration: CalibrationConfig = CalibrationConfig()
     """from the drives' samples to positions"""
     latency_ticks: int = Field(0, ge=0, le=20)
-    """age of the newest sample when a cycle reads it, ticks, as a bus to the drives has it; the
+    """age of the newest sample when a cycle reads it [ticks], as a bus to the drives has it; the
     simulated arm's samples are that old, too"""
     wrist: WristConfig | None = None
     """force/torque sensor, if the arm has one"""
     hand: HandConfig | None = None
     """tendons and fingers, for a hand in place of an arm"""
     patience_ms: Positive | None = Field(None, le=100.0)
-    """time without a new torque for which motors keep the last one, ms; then the brakes engage;
+    """time without a new torque for which motors keep the last one [ms]; then the brakes engage;
     rounded down to whole torque cycles, at least one; default: by what the arm does in it, see
     `rack check --verbose`"""
     substeps: int = Field(5, ge=1, le=50)
     """MuJoCo steps in one servo cycle"""
     min_armature: Finite = Field(0.05, ge=0)
-    """least drive inertia of every joint, kg m2: light wrists need it"""
+    """least drive inertia of every joint [kg m2]: light wrists need it"""
     enable: Literal["at-start", "by-command"] | None = None
     """when drives are asked for torque: at the start, or by `rack command RACK servo enable`;
     default: at-start for the simulated arm, by-command for every other"""
@@ -406,11 +407,11 @@ class MotionConfig(Table):
     body: str
     """obstacle that moves"""
     at: Moment
-    """simulated time when it starts, s"""
+    """simulated time when it starts [s]"""
     to: Vector
-    """where its origin goes, m"""
+    """where its origin goes [m]"""
     speed: Positive = 0.25
-    """speed along the straight line, m/s"""
+    """speed along the straight line [m/s]"""
 
 
 class PushConfig(Table):
@@ -419,13 +420,13 @@ class PushConfig(Table):
     body: str
     """object that is pushed"""
     at: Moment
-    """simulated time when it begins, s"""
+    """simulated time when it begins [s]"""
     seconds: Positive
-    """time for which it lasts, s"""
+    """time for which it lasts [s]"""
     force: Vector
-    """force at the centre of mass, in the world's frame, N"""
+    """force at the centre of mass, in the world's frame [N]"""
     rise: NotNegative = 0.0
-    """time in which it rises, and in which it falls at its end, s"""
+    """time in which it rises, and in which it falls at its end [s]"""
 
 
 class GoalConfig(Table):
@@ -436,11 +437,11 @@ class GoalConfig(Table):
     object: str
     """object that the task moves, or keeps"""
     position: Vector
-    """where its origin ends, m"""
+    """where its origin ends [m]"""
     # A gripper centres a part across its pads, not along them: there it stays as far off as it was
     # taken, or slips.
     tolerance_mm: Positive = 10.0
-    """distance from there at which the task still counts as done, mm"""
+    """distance from there at which the task still counts as done [mm]"""
 
 
 class SceneConfig(Table):
@@ -453,7 +454,7 @@ class SceneConfig(Table):
     supports: tuple[str, ...] = ()
     """geoms on which objects may stand, and a tool on a wrist sensor may press"""
     clearance: Positive = 0.015
-    """distance that planned motion keeps from everything, m"""
+    """distance that planned motion keeps from everything [m]"""
     motion: tuple[MotionConfig, ...] = ()
     """moves of obstacles, by time"""
     push: tuple[PushConfig, ...] = ()

@@ -18,13 +18,13 @@ class WorldParams(Table):
     """When a body counts as moving."""
 
     moved: Positive = 0.002
-    """distance from where it rested at which a body moves, m"""
+    """distance from where it rested at which a body moves [m]"""
     turned: Positive = 0.02
-    """angle from how it rested at which a body moves, rad"""
+    """angle from how it rested at which a body moves [rad]"""
     slow: Positive = 0.005
-    """speed below which a moving body may be resting, m/s"""
+    """speed below which a moving body may be resting [m/s]"""
     resting: Positive = 0.2
-    """time of being slow after which it rests, s"""
+    """time of being slow after which it rests [s]"""
 
 
 class WorldModel(Executor):

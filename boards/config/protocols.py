@@ -20,9 +20,9 @@ class InterruptConfig(Table):
     """`[protocol.interrupt]`: the cost of messages that interrupt the boards that read them."""
 
     fixed_us: Microseconds = 50.0
-    """time of the interrupt handler for a message of no words, us"""
+    """time of the interrupt handler for a message of no words [us]"""
     word_us: Microseconds = 1.0
-    """its time for every word of 4 bytes, us"""
+    """its time for every word of 4 bytes [us]"""
     depth: int = Field(16, ge=1, le=MOST_UNREAD)
     """largest number of interrupts that wait at one board; others are lost"""
 

@@ -19,11 +19,11 @@ class RecordConfig(Table):
     """
 
     keep: Stretch | None = None
-    """last stretch kept, s; simulated time; also as in "10 min" or "30 s"; default: all"""
+    """last stretch kept [s]; simulated time; also as in "10 min" or "30 s"; default: all"""
     before: Span = 5.0
-    """kept before each of these, s; also as in "5 s" """
+    """kept before each of these [s]; also as in "5 s" """
     after: Span = 5.0
-    """kept after each of these, s; also as in "5 s" """
+    """kept after each of these [s]; also as in "5 s" """
 
     @model_validator(mode="after")
     def _remembers(self) -> Self:

@@ -7,7 +7,6 @@ depend on the config.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -25,12 +24,6 @@ from rack.boards.faults.kind import KINDS
 from rack.levels.ports import FindingKind
 from rack.levels.tables import keys_of
 
-UNIT = re.compile(
-    r", ((?:kg m2|N s/m|N/\(m s\)|N/m|N m/rad|N"
-    r" m|N|rad/s[23]?|rad|m/s|mm|m|ms|us|1/s|s|Hz|ticks|cycles)"
-    r"(?: or (?:rad/s|rad|N m s/rad|N m/rad|N m))?)(?=$|[;:,])"
-)
-"""The unit in a description: between a comma and the end, or further punctuation."""
 REQUIRED = "required"
 NAME = ".<name>"
 LEAST = {"minimum": "at least", "exclusiveMinimum": "above"}
@@ -166,18 +159,18 @@ def _named(entry: Schema) -> Iterator[Schema]:
 
 
 def _key(name: str, entry: Schema, is_required: bool) -> Key:
-    description = entry.get("description", "")
-    unit = UNIT.search(description)
+    before, _, rest = entry.get("description", "").partition(" [")
+    unit, _, after = rest.partition("]")
     given = entry.get("default")
     default = "" if given in (None, [], {}) else shown(given)
     kind, permitted = _values(entry)
     return Key(
         name=name,
         type=kind,
-        unit=unit[1] if unit else "",
+        unit=unit,
         permitted=permitted[0] if permitted else "",
         default=REQUIRED if is_required else default,
-        meaning=UNIT.sub("", description, count=1) + "; live: `rack set`" * ("live" in entry),
+        meaning=before + after + "; live: `rack set`" * ("live" in entry),
     )
 
 
@@ -230,7 +223,7 @@ def _number(value: float) -> str:
 def _summary(docstring: str) -> str:
     """Return the first sentence of a table's docstring, without its heading."""
     text = " ".join(docstring.partition("\n\n")[0].split())
-    text = re.sub(r"^`\[.*?\]`: ", "", text).partition(". ")[0].rstrip(".")
+    text = text.rpartition("]`: ")[2].partition(". ")[0].rstrip(".")
     return text[:1].lower() + text[1:]
 
 

@@ -6,30 +6,26 @@ levels while this process resolves the config.
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from resource import RLIMIT_MEMLOCK, RLIMIT_NOFILE, getrlimit
 from typing import Any, cast
 
 from rack.backplane.fault_table import Injection
 from rack.backplane.layout import Layout
 from rack.backplane.operator_table import Request
-from rack.backplane.process import DEADLINE, cores_kept_awake, mapped_and_locked
-from rack.backplane.segment import Segment
-from rack.backplane.words import Block, Demand
+from rack.backplane.words import Demand
 from rack.boards.config.cell import cell_sizes
 from rack.boards.config.commands import command_mistakes, requests
 from rack.boards.config.connections import TaskPorts, Wiring
 from rack.boards.config.injections import fault_mistakes, injections, places
-from rack.boards.config.layout import KEPT_S, LayoutMaker, exchanges, obtained_core, shared_out
+from rack.boards.config.layout import KEPT_S, LayoutMaker, exchanges, obtained_core
 from rack.boards.config.published import PublishedRack, publish
 from rack.boards.config.rules import broken_rules, network_rules
 from rack.boards.config.rules.levels import memory, neighbours, sizes
 from rack.boards.config.schema import LAN, CommandConfig, RackConfig
 from rack.boards.config.timing import is_critical, reservation
 from rack.boards.config.toml import table_of, without
-from rack.boards.errors import ConfigError, LaunchError, Mistake
+from rack.boards.errors import ConfigError, Mistake
 from rack.boards.faults.config import FaultConfig
 from rack.boards.faults.kind import KINDS
 from rack.boards.wiring import (
@@ -51,17 +47,6 @@ SILENT_S = 30.0
 AHEAD_S = KEPT_S / 2
 """Simulated time by which lockstep may run ahead of a recorder: half of the time that the rings
 retain."""
-_PERMIT = (
-    "To allow it, add the line '@GROUP - {}' for one of your groups to /etc/security/limits.conf"
-    " and log in again (ulimit -{} shows the limit), or grant {}"
-)
-PERMIT = _PERMIT.format("rtprio 99", "r", "CAP_SYS_NICE")
-"""How a user obtains real-time priorities."""
-PERMIT_LOCK = _PERMIT.format("memlock unlimited", "l", "CAP_IPC_LOCK")
-FILES = 32
-"""Files that a process of a rack may have open, beside one for each other process and each mailbox
-that it writes."""
-
 LAYOUT_NEEDS = {"clock", "protocol", "robot", "scene", "task"}
 """Tables without which there is no layout, and no level can judge its neighbours."""
 
@@ -174,85 +159,6 @@ class Resolved:
         """
         priorities = [t.priority for t in self.layout.tasks if t.priority and t.role == "executor"]
         return max(min(priorities, default=0) - 1, 0)
-
-    def notes(self, segment: Segment) -> list[str]:
-        """Return notes for the launch to report: cores replaced, priorities refused, idle cores
-        held awake, ...
-        """
-        refused = self._refused(segment)
-        found = [*self.config.changed, *shared_out(self.config)]
-        if (network := network_rules(self.config)) is not None:
-            found += network.network_notes(self.config)
-        found += [f"{refused}; missed deadlines are likely. {PERMIT}"] if refused else []
-        found += self._reserved(segment)
-        found += self._unlocked(segment)
-        if self.clock(None).keeps_awake:
-            with cores_kept_awake() as refusal:
-                found.append(
-                    f'clock.idle_cores = "awake": {refusal or "idle cores are held awake"}'
-                )
-        if self.config.is_lockstep:
-            why = "sends enters at ticks that depend on its timing; --entries RUN repeats a run"
-            found += [f"what {host.board} {why}" for host in self.hosts if host.is_external]
-        return found
-
-    def check_realtime(self, segment: Segment) -> None:
-        """Raise `LaunchError` if a real-time priority was refused and the config requires it."""
-        if self.config.clock.on_no_realtime == "refuse" and (refused := self._refused(segment)):
-            raise LaunchError(f'{refused}, and clock.on_no_realtime is "refuse". {PERMIT}')
-
-    def check_files(self) -> None:
-        """Raise `LaunchError` if the system permits too few open files for this rack."""
-        needed = FILES + len(self.layout.processes) + len(self.layout.mailboxes)
-        if 0 <= (allowed := getrlimit(RLIMIT_NOFILE)[0]) < needed:
-            why = f"at most {allowed} open files are permitted (ulimit -n); the rack needs {needed}"
-            raise LaunchError(f"rack '{self.config.name}': {why}")
-
-    def _unlocked(self, segment: Segment) -> Iterator[str]:
-        """Yield which tasks have not locked their memory, and the limit."""
-        if self.config.is_lockstep:
-            return
-        unlocked = {}
-        for task in self.layout.tasks:
-            mapped, locked = mapped_and_locked(segment.block(task.name)[Block.PID])
-            if not locked:
-                unlocked[task.name] = mapped
-        if unlocked:
-            yield (
-                f"memory not locked for {', '.join(unlocked)}: the limit is"
-                f" {getrlimit(RLIMIT_MEMLOCK)[0]} bytes, a board maps {max(unlocked.values())};"
-                f" page faults may delay cycles. {PERMIT_LOCK}"
-            )
-
-    def _reserved(self, segment: Segment) -> Iterator[str]:
-        """Yield who has a reservation, on which cores, and who was refused one."""
-        asking = {
-            task.task: segment.block(task.task)
-            for task in self.tasks
-            if task.reservation is not None
-        }
-        given = [name for name, block in asking.items() if block[Block.PRIORITY] == DEADLINE]
-        pinned = [name for name in given if len(os.sched_getaffinity(asking[name][Block.PID])) == 1]
-        for what, names in (
-            ("earliest deadline first by SCHED_DEADLINE, on their cores", pinned),
-            ("earliest deadline first by SCHED_DEADLINE, on any core", set(given) - set(pinned)),
-            ("SCHED_DEADLINE refused, fixed priorities", asking.keys() - set(given)),
-        ):
-            if names:
-                yield f"{what}: {', '.join(sorted(names))}"
-
-    def _refused(self, segment: Segment) -> str:
-        if self.config.is_lockstep:
-            # It has no deadlines to miss.
-            return ""
-        refused = [
-            t.name
-            for t in self.layout.tasks
-            if t.priority and not segment.block(t.name)[Block.PRIORITY]
-        ]
-        return (
-            f"SCHED_FIFO refused, ordinary scheduling for {', '.join(refused)}" if refused else ""
-        )
 
 
 def _examined(config: RackConfig, further: Iterable[Mistake] = ()) -> Examination:

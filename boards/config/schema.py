@@ -2,7 +2,7 @@
 
 `[robot]` and `[scene]` are declared in `rack.levels.robot` and `rack.levels.scene`; what `[task]`
 and `[board.<name>.params]` may hold is declared by the classes of the levels. In a description the
-unit follows a comma; `rack schema` shows it in a separate column.
+unit stands in brackets; `rack schema` shows it in a separate column.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ class ClockConfig(Table):
     on_no_realtime: Literal["refuse", "warn"] = "warn"
     """if a SCHED_FIFO priority is refused: warn and continue, or refuse to launch"""
     period_ms: float = Field(ge=SHORTEST_MS, le=1000, allow_inf_nan=False)
-    """tick period, ms; a whole number of ns"""
+    """tick period [ms]; a whole number of ns"""
     mode: Mode = "realtime"
     """realtime: ticks follow wall-clock time; lockstep: each tick comes once every task is done"""
     speed: float = Field(1.0, ge=0.001, le=1000, allow_inf_nan=False)
@@ -109,12 +109,12 @@ class TimingConfig(Table):
     """`[timing]`: assumptions of the timing model about the processors."""
 
     context_switch_ms: Milliseconds = 0.1
-    """time of one context switch (t_cs), ms; the paper takes 0.1"""
+    """time of one context switch (t_cs) [ms]; the paper takes 0.1"""
     response_ms: float | None = Field(None, ge=SHORTEST_MS, le=1e9)
-    """goal for the response time R_s of the system (eqs 3.2, 3.3), ms; simulated time; R_max is R_s
-    / n"""
+    """goal for the response time R_s of the system (eqs 3.2, 3.3) [ms]; simulated time; R_max is
+    R_s / n"""
     clock_ms: Milliseconds = 0.0
-    """processor time of the system clock's board per tick, ms"""
+    """processor time of the system clock's board per tick [ms]"""
     small_share: float = Field(0.1, gt=0, le=1)
     """largest fraction of a cycle that counts as much smaller than it (eq. 3.10)"""
 
@@ -125,28 +125,28 @@ class ScheduleConfig(Table):
     """
 
     minor_ms: Positive
-    """minor frame, ms; a whole number of ticks, of which every board's cycle is a multiple"""
+    """minor frame [ms]; a whole number of ticks, of which every board's cycle is a multiple"""
     major_ms: Positive
-    """major frame, ms; a multiple of the minor one, which every board's cycle divides"""
+    """major frame [ms]; a multiple of the minor one, which every board's cycle divides"""
 
 
 class BudgetConfig(Table):
     """`[board.<name>.budget]`: the level's worst-case processor times, for the timing model."""
 
     read_ms: Milliseconds = 0.0
-    """R: read commands and statuses, per cycle, ms"""
+    """R: read commands and statuses, per cycle [ms]"""
     process_ms: Milliseconds = 0.0
-    """X: process, per cycle, ms"""
+    """X: process, per cycle [ms]"""
     write_ms: Milliseconds = 0.0
-    """W: write commands and statuses, per cycle, ms"""
+    """W: write commands and statuses, per cycle [ms]"""
     exchange_ms: Milliseconds = 0.0
-    """C: read the plan, per cycle, ms"""
+    """C: read the plan, per cycle [ms]"""
     plan_ms: Milliseconds = 0.0
-    """P: plan, per plan, ms"""
+    """P: plan, per plan [ms]"""
     update_ms: Milliseconds = 0.0
-    """U: write the plan, per plan, ms"""
+    """U: write the plan, per plan [ms]"""
     plan_within_ms: float | None = Field(None, gt=0, le=1e7)
-    """longest acceptable time for a new plan, ms; an upper limit on within_cycles"""
+    """longest acceptable time for a new plan [ms]; an upper limit on within_cycles"""
 
 
 class TransferConfig(Table):
@@ -155,13 +155,13 @@ class TransferConfig(Table):
     """
 
     read_ms: Milliseconds = 0.0
-    """R: the executor reads commands and statuses, per cycle, ms"""
+    """R: the executor reads commands and statuses, per cycle [ms]"""
     write_ms: Milliseconds = 0.0
-    """W: the executor writes commands and statuses, per cycle, ms"""
+    """W: the executor writes commands and statuses, per cycle [ms]"""
     exchange_ms: Milliseconds = 0.0
-    """C: the executor reads the plan, per cycle, ms"""
+    """C: the executor reads the plan, per cycle [ms]"""
     update_ms: Milliseconds = 0.0
-    """U: the planner writes its plan, ms"""
+    """U: the planner writes its plan [ms]"""
 
 
 class ExchangeConfig(Table):
@@ -172,7 +172,7 @@ class ExchangeConfig(Table):
     every: int = Field(1, ge=1, le=LONGEST_EVERY)
     """read in every n-th cycle; in between, the last message stays"""
     phase: int = Field(0, ge=0)
-    """number, less than every, of the first cycle that reads it, cycles"""
+    """number, less than every, of the first cycle that reads it [cycles]"""
     asynchronous: bool = False
     """read the newest message as soon as it is written; in real time, runs then differ"""
 
@@ -185,9 +185,9 @@ class SupervisionConfig(Table):
     restarts: Restarts = 5
     """maximum number of restarts of one task within within_s; 0: never restart"""
     within_s: Positive = 10.0
-    """time window in which restarts are counted, s; simulated time"""
+    """time window in which restarts are counted [s]; simulated time"""
     lockstep_restart_s: Positive = 0.5
-    """in lockstep, simulated time until a lost task returns, s; in real time it returns when
+    """in lockstep, simulated time until a lost task returns [s]; in real time it returns when
     ready"""
     max_missed_fraction: float = Field(0.05, ge=0, le=1)
     """largest fraction of its cycles that a level may miss or skip in a run that succeeds, rounded
@@ -213,18 +213,18 @@ class PlacedConfig(Table):
     restarts: Restarts | None = None
     """overrides supervision.restarts for this board's tasks"""
     restarts_within_s: Positive | None = None
-    """overrides supervision.within_s for this board's tasks, s"""
+    """overrides supervision.within_s for this board's tasks [s]"""
 
 
 class BoardConfig(PlacedConfig):
     """`[board.<name>]`: one processor of the rack, its level, and its wiring."""
 
     rate_hz: Positive | None = Field(None, ge=1e-6)
-    """rate of the executor, Hz; must divide the clock rate; give either rate_hz or every"""
+    """rate of the executor [Hz]; must divide the clock rate; give either rate_hz or every"""
     every: int | None = Field(None, ge=1, le=LONGEST_EVERY)
-    """instead of rate_hz: period of the executor, ticks"""
+    """instead of rate_hz: period of the executor [ticks]"""
     phase: int = Field(0, ge=0)
-    """first tick of the board, less than its period; its releases follow every period, ticks"""
+    """first tick of the board, less than its period; its releases follow every period [ticks]"""
     wake: Wake | None = None
     """how this board waits for its next cycle; default: clock.wake"""
     above: Neighbours = ()
@@ -238,7 +238,7 @@ class BoardConfig(PlacedConfig):
     coupling: Coupling = "none"
     """tight: planner on this board; loose: on its own board; none: no planner"""
     within_cycles: int = Field(1, ge=1, le=10_000)
-    """time allowed for one plan, cycles"""
+    """time allowed for one plan [cycles]"""
     planner_slot: Slot | None = None
     """slot of a loosely coupled planner"""
     planner_core: Core | None = None
@@ -278,7 +278,7 @@ class LanConfig(PlacedConfig, LanTable):
     """
 
     rate_hz: Positive = Field(50.0, ge=1e-6)
-    """rate of the board, Hz; must divide the clock rate"""
+    """rate of the board [Hz]; must divide the clock rate"""
 
     def board(self) -> BoardConfig:
         """Return the board."""
@@ -315,11 +315,11 @@ class HostConfig(Table):
     """parameters of the program, declared by its class"""
     computing_ms: float = Field(0.0, ge=0.0, le=1e9)
     """in lockstep, simulated time from a wake-up until what it sends is passed on and it may be
-    woken again, ms; in real time its computing takes as long as it takes"""
+    woken again [ms]; in real time its computing takes as long as it takes"""
     restarts: Restarts | None = None
     """overrides supervision.restarts for this board"""
     restarts_within_s: Positive | None = None
-    """overrides supervision.within_s for this board, s"""
+    """overrides supervision.within_s for this board [s]"""
 
 
 class CommandConfig(Table):
@@ -349,11 +349,11 @@ class CommandConfig(Table):
     tick: Tick | None = None
     """tick at which the command is issued; give at most one of tick, at"""
     at: Moment | None = None
-    """instead of tick: simulated time, s"""
+    """instead of tick: simulated time [s]"""
     joints: tuple[Finite, ...] | None = None
-    """goal: one position per joint, rad"""
+    """goal: one position per joint [rad]"""
     position: Vector | None = None
-    """goal: tool position, m; with quaternion or direction"""
+    """goal: tool position [m]; with quaternion or direction"""
     quaternion: tuple[Finite, Finite, Finite, Finite] | None = None
     """goal: tool orientation as w, x, y, z"""
     direction: Vector | None = None

@@ -56,9 +56,9 @@ class EntryConfig(Table):
     source: str = Key(alias="from")
     """mailbox to pass, as in program.requests; its side is the direction"""
     every: int = Key(1, ge=1, le=LAST_TICK)
-    """exchange in every n-th cycle of the bridge, cycles"""
+    """exchange in every n-th cycle of the bridge [cycles]"""
     phase: int = Key(0, ge=0)
-    """with every: which of the n cycles, cycles"""
+    """with every: which of the n cycles [cycles]"""
     asynchronous: bool = False
     """pass each message as it comes, once; default: the newest, repeatedly"""
     most: int = Key(8, ge=1, le=256)

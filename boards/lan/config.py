@@ -47,7 +47,7 @@ class ExportConfig(Table):
     source: Local = Field(alias="from")
     """mailbox, as in task.status; others import it as RACK/task.status"""
     rate_hz: float = Field(10.0, gt=0, le=FASTEST_HZ)
-    """rate of the exchange, Hz; divides the adapter's"""
+    """rate of the exchange [Hz]; divides the adapter's"""
 
 
 class ImportConfig(Table):
@@ -60,9 +60,9 @@ class ImportConfig(Table):
     type: TypeName
     """message class of that mailbox, package.module:Class"""
     rate_hz: float = Field(10.0, gt=0, le=FASTEST_HZ)
-    """rate of the exchange, Hz; divides the adapter's"""
+    """rate of the exchange [Hz]; divides the adapter's"""
     max_age_ms: Positive
-    """age from which a message is old and its writer counts as lost, ms; simulated time"""
+    """age from which a message is old and its writer counts as lost [ms]; simulated time"""
 
     @property
     def rack(self) -> str:
@@ -97,7 +97,7 @@ class LanTable(Table):
     insecure: bool = False
     """permit endpoints without TLS beyond loopback, or without certificates on it"""
     lease_ms: float = Field(500.0, ge=20, le=60_000)
-    """real time of silence from which a peer is lost, ms"""
+    """real time of silence from which a peer is lost [ms]"""
     on_peer_loss: OnPeerLoss = "hold"
     """while a rack that was there is lost: hold: levels find what it writes lost at once, and hold,
     until its first message after that; stop: the same, and the arm ramps to rest, then brakes,

@@ -28,16 +28,16 @@ class ElementalMoveParams(Table):
     """
 
     patience: Positive = 60.0
-    """time that a move waits for a free path before it is an error, s"""
+    """time that a move waits for a free path before it is an error [s]"""
     retry: Positive = 2.0
-    """time after which a path is searched again in a world at rest, s"""
+    """time after which a path is searched again in a world at rest [s]"""
     replans: int = Field(10, ge=1, le=1000)
     """other paths that one move may take before a blocked way is an error"""
     grasp_gap: Positive | None = None
-    """a gripper closer to closed than this holds nothing, m or rad; default: a twentieth of its
+    """a gripper closer to closed than this holds nothing [m or rad]; default: a twentieth of its
     way"""
     answer: Positive = 0.3
-    """time that settling and the report from below may take, s"""
+    """time that settling and the report from below may take [s]"""
 
 
 class PlanStore:

@@ -172,7 +172,7 @@ class ModifiableParams(Table):
     modifications: dict[ModificationName, ModificationConfig] = {}
     """control modifications by name, in the order in which they act"""
     transfer: Positive = Field(0.05, le=10.0)
-    """time in which the torque goes over to that of a law modified otherwise, s"""
+    """time in which the torque goes over to that of a law modified otherwise [s]"""
 
     @field_validator("modifications")
     @classmethod

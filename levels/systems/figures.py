@@ -43,9 +43,9 @@ class FigureParams(Table):
     """
 
     process_ms: Milliseconds | Annotated[tuple[Milliseconds, ...], Parameter(min_length=1)] = 2.0
-    """X: the executor in a cycle, ms; several times are taken in turn, cycle by cycle"""
+    """X: the executor in a cycle [ms]; several times are taken in turn, cycle by cycle"""
     plan_ms: Milliseconds = 6.0
-    """P: one plan, without its update, ms"""
+    """P: one plan, without its update [ms]"""
 
 
 class FigureLoop(Executor):

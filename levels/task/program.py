@@ -22,7 +22,7 @@ class Action(Table):
     """Base of all actions."""
 
     by: Positive | None = None
-    """simulated time by which the action must be done, s"""
+    """simulated time by which the action must be done [s]"""
 
 
 class Transfer(Action):
@@ -33,11 +33,11 @@ class Transfer(Action):
     object: str
     """object of the scene"""
     to: Vector
-    """where the object's origin goes, m"""
+    """where the object's origin goes [m]"""
     yaw: Finite | None = None
-    """turn of the object's x axis there, rad; free when not given"""
+    """turn of the object's x axis there [rad]; free when not given"""
     lift: Positive = 0.1
-    """height of the straight motion above grasp and release, m"""
+    """height of the straight motion above grasp and release [m]"""
 
     def __str__(self) -> str:
         return f"transfer {self.object} to {list(self.to)}"
@@ -49,14 +49,14 @@ class Goto(Action):
     do: Literal["goto"] = "goto"
     """the kind of action"""
     position: Vector | None = None
-    """of the tool, m"""
+    """of the tool [m]"""
     quaternion: tuple[Finite, Finite, Finite, Finite] | None = None
     """of the tool, as w, x, y, z"""
     direction: Vector | Literal["any"] | None = None
     """of the tool's z axis, any turn about it; down when not given; 'any': an arm of five joints or
     fewer reaches most places in few orientations"""
     joints: tuple[Finite, ...] | None = None
-    """joint positions, rad"""
+    """joint positions [rad]"""
 
     @model_validator(mode="after")
     def _one_goal(self) -> Goto:
@@ -119,14 +119,14 @@ class TaskParams(Table):
     """
 
     beginning: Positive = 0.1
-    """from a segment's arrival in the primitive level to motion, s"""
+    """from a segment's arrival in the primitive level to motion [s]"""
     settling: Positive = 0.2
-    """from the end of a motion to the report that it is done, s"""
+    """from the end of a motion to the report that it is done [s]"""
     gripping: Positive = 0.6
-    """time that the gripper takes to open or close and to settle, s"""
+    """time that the gripper takes to open or close and to settle [s]"""
     stalled_s: Positive = 90.0
     """time without any progress after which the task ends, unless an operator holds it; longer than
-    the patience of the level below, s"""
+    the patience of the level below [s]"""
 
 
 read_program = TaskConfig.read

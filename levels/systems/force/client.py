@@ -76,11 +76,11 @@ class ContactConfig(Table):
     frame: str
     """task frame"""
     wrench: dict[Axis, Finite] = {}
-    """of the tool on the surroundings on axes of force, N or N m; by axis"""
+    """of the tool on the surroundings on axes of force [N or N m]; by axis"""
     speed: dict[Axis, Positive] = {}
-    """most on an axis of force, m/s or rad/s; by axis; default: the server's"""
+    """most on an axis of force [m/s or rad/s]; by axis; default: the server's"""
     guard: dict[Axis, Positive] = {}
-    """wrench, either way, that ends a motion, N or N m; by axis"""
+    """wrench, either way, that ends a motion [N or N m]; by axis"""
 
 
 class ForceProgram(Program):

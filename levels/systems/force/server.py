@@ -44,19 +44,19 @@ class ServerParams(TrajectoryParams):
     """`[board.<name>.params]`: how contacts are judged, and what happens without a client."""
 
     speed: Positive = 0.05
-    """most on an axis of force, where a request gives none, m/s"""
+    """most on an axis of force, where a request gives none [m/s]"""
     turning: Positive = 0.2
-    """the same about an axis, rad/s"""
+    """the same about an axis [rad/s]"""
     tolerance: Positive = Field(0.3, le=1.0)
     """part of a wanted force by which it may be off"""
     settle: Positive = 0.2
-    """time for which forces are within it when they are settled, and a COMPLY is done, s"""
+    """time for which forces are within it when they are settled, and a COMPLY is done [s]"""
     reach: Positive = 4.0
-    """longest time without settled forces, s: then compliance ends"""
+    """longest time without settled forces [s]: then compliance ends"""
     silence: Positive = 2.0
-    """time without a sign of life after which the client is lost, s"""
+    """time without a sign of life after which the client is lost [s]"""
     hold: Positive = 3.0
-    """time for which forces are held without a client, s"""
+    """time for which forces are held without a client [s]"""
 
 
 class ServerWork(RequestWork):

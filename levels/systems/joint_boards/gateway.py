@@ -30,7 +30,7 @@ class GatewayParams(Table):
     """`[board.<name>.params]`: the link to the level above, and what to do without it."""
 
     delay: NotNegative = Field(0.0, le=1.0)
-    """time that the link takes, each way, s"""
+    """time that the link takes, each way [s]"""
     missing: int = Field(5, ge=0, le=1000)
     """references in a row that may be missing and are extrapolated"""
 
@@ -154,9 +154,9 @@ class NetworkGatewayParams(GatewayParams):
     """`[board.<name>.params]`: the link, and the rack at its other end."""
 
     period: Positive = Field(0.02, le=1.0)
-    """time from reference to reference, s"""
+    """time from reference to reference [s]"""
     tick: Positive = Field(0.001, le=1.0)
-    """length of a tick of the rack that sends references, s"""
+    """length of a tick of the rack that sends references [s]"""
 
 
 class NetworkGateway(JointGateway):

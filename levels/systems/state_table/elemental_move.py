@@ -53,7 +53,7 @@ class TaughtPoseConfig(Table):
     """`[plan.pose.<name>]`: a pose of the tool, pointing down, relative to an object or a place."""
 
     height: Finite
-    """of the tool above its origin, m"""
+    """of the tool above its origin [m]"""
     speed: Positive = Key(1.0, le=1.0)
     """part of the joints' limits on the way there"""
 
@@ -64,9 +64,9 @@ class MovePlanConfig(Table):
     pose: dict[Name, TaughtPoseConfig] = Key(min_length=1)
     """poses by name"""
     place: dict[Name, Place] = {}
-    """origin of an object put there, m, by name"""
+    """origin of an object put there [m], by name"""
     moved: NotNegative = 0.01
-    """distance from where it was sensed , or should stand, at which an object is displaced, m"""
+    """distance from where it was sensed , or should stand, at which an object is displaced [m]"""
     home_speed: Positive = Key(1.0, le=1.0)
     """part of the joints' limits on the way home"""
 

@@ -72,7 +72,7 @@ class PrimitivePlanConfig(Table):
     """`[plan]` of the primitive level's table."""
 
     settled: Positive = 0.01
-    """distance from its end at which a joint has arrived, rad"""
+    """distance from its end at which a joint has arrived [rad]"""
 
 
 class PrimitiveTable(StateTableExecutor):

@@ -50,9 +50,9 @@ class MotionStep(Table):
     """Base of the steps that move the arm."""
 
     segment: NotNegative = 0.0
-    """time of the segment, s; 0: from the limits; too short: stretched"""
+    """time of the segment [s]; 0: from the limits; too short: stretched"""
     acceleration: NotNegative = 0.0
-    """half the time of the blend into it, s; 0: the level's default"""
+    """half the time of the blend into it [s]; 0: the level's default"""
 
 
 class HomeStep(MotionStep):
@@ -68,9 +68,9 @@ class MoveStep(MotionStep):
     do: Literal["move"] = "move"
     """the kind of step"""
     joints: tuple[Finite, ...] | None = None
-    """joint positions, rad"""
+    """joint positions [rad]"""
     position: Vector | None = None
-    """of the tool, m"""
+    """of the tool [m]"""
     quaternion: Turn | None = None
     """of the tool, as w, x, y, z; as at home when not given"""
 
@@ -91,7 +91,7 @@ class LineStep(MotionStep):
     do: Literal["line"] = "line"
     """the kind of step"""
     position: Vector
-    """of the tool, m, in the frame of `body`"""
+    """of the tool [m], in the frame of `body`"""
     quaternion: Turn | None = None
     """of the tool, as w, x, y, z, in that frame; as at home by default"""
     body: str | None = None
@@ -114,7 +114,7 @@ class StayStep(Table):
     do: Literal["stay"] = "stay"
     """the kind of step"""
     seconds: Positive
-    """for how long, s"""
+    """for how long [s]"""
 
 
 class GripStep(Table):
@@ -123,11 +123,11 @@ class GripStep(Table):
     do: Literal["grip"] = "grip"
     """the kind of step"""
     opening: Finite
-    """gripper joint position, m or rad"""
+    """gripper joint position [m or rad]"""
     force: Positive | None = None
-    """largest force, N or N m; that of the gripper when not given"""
+    """largest force [N or N m]; that of the gripper when not given"""
     seconds: NotNegative = 0.0
-    """time that it takes, s; 0: the level's default"""
+    """time that it takes [s]; 0: the level's default"""
 
 
 class CancelStep(Table):
@@ -136,7 +136,7 @@ class CancelStep(Table):
     do: Literal["cancel"] = "cancel"
     """the kind of step"""
     after: NotNegative
-    """time after the step before it began, s"""
+    """time after the step before it began [s]"""
 
 
 Step = MoveStep | LineStep | HomeStep | StayStep | GripStep | CancelStep

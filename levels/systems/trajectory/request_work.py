@@ -30,13 +30,13 @@ class TrajectoryParams(Table):
     """Times of motions and of following, in `[board.<name>.params]`."""
 
     acceleration: Positive = 0.3
-    """half the time of a blend, where a request gives none, s"""
+    """half the time of a blend, where a request gives none [s]"""
     gripping: Positive = 0.6
-    """time of a GRIP, where a request gives none, s"""
+    """time of a GRIP, where a request gives none [s]"""
     follow: Positive = 0.25
-    """time constant with which a live goal follows its body, s"""
+    """time constant with which a live goal follows its body [s]"""
     blind: Positive = 0.3
-    """time for which a body's motion is extrapolated, s"""
+    """time for which a body's motion is extrapolated [s]"""
     handover: int = Field(HANDOVER_CYCLES, ge=1, le=1000)
     """cycles until statuses must show that the first set point is followed"""
 

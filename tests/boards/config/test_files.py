@@ -125,7 +125,7 @@ def test_an_incomplete_arm_is_reported_to_inherit_nothing(write: Write) -> None:
     alone = (
         "a [robot] with its own model is a different arm and inherits nothing from extended files"
     )
-    assert f"robot.jerk: missing; jerk limits of planned motion, rad/s3; {alone}" in lines(error)
+    assert f"robot.jerk: missing; jerk limits of planned motion [rad/s3]; {alone}" in lines(error)
 
 
 DEEP = {

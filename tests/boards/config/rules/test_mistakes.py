@@ -54,7 +54,7 @@ MISTAKES = {
     ),
     "truth for a number": (
         "clock.period_ms=true",
-        "clock.period_ms = true: should be a valid number; tick period, ms",
+        "clock.period_ms = true: should be a valid number; tick period [ms]",
     ),
     "short tick in real time": (
         "clock={ mode = 'realtime', speed = 500 }",
