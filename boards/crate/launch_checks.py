@@ -48,7 +48,7 @@ def list_launch_notes(plan: Resolved, segment: Segment) -> Iterator[str]:
     yield from config.changed
     yield from shared_out(config)
     if (network := network_rules(config)) is not None:
-        yield from network.network_notes(config)
+        yield from network.list_network_notes(config)
     if config.is_lockstep:
         why = "sends enters at ticks that depend on its timing; --entries RUN repeats a run"
         yield from (f"what {host.board} {why}" for host in plan.hosts if host.is_external)

@@ -244,6 +244,6 @@ def test_the_clock_takes_no_lock_for_an_operator(config: MakeConfig) -> None:
     with pytest.raises(ConfigError, match="the clock writes it and must not wait"):
         wire(config("protocol.mailbox={'upper.operator' = 'lock'}", text=COMMANDED))
     with pytest.raises(
-        ConfigError, match="the clock writes it, not a board; permitted: time-slice, double-buffer"
+        ConfigError, match="the clock writes it, not a board; must be time-slice or double-buffer"
     ):
         wire(config("protocol.mailbox={'upper.operator' = 'interrupt'}", text=COMMANDED))

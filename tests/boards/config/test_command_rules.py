@@ -64,7 +64,7 @@ MISTAKES: list[tuple[dict[str, Any], str]] = [
     ),
     (
         {"level": "servo", "what": "setpoint", **PLACE},
-        "position: not a goal for setpoint of 'servo'; permitted: joints",
+        "position: not a goal for setpoint of 'servo'; valid goals: joints",
     ),
     (
         {"level": "task", "what": "goto", "quaternion": [1.0, 0.0, 0.0, 0.0]},
@@ -78,7 +78,7 @@ MISTAKES: list[tuple[dict[str, Any], str]] = [
             "direction": [0.0, 0.0, 1.0],
             "quaternion": [1.0, 0.0, 0.0, 0.0],
         },
-        "direction = [0.0, 0.0, 1.0]: quaternion is also given; permitted: one of quaternion,"
+        "direction = [0.0, 0.0, 1.0]: quaternion is also given; give only one of quaternion,"
         " direction",
     ),
     (
@@ -91,15 +91,15 @@ MISTAKES: list[tuple[dict[str, Any], str]] = [
     ),
     (
         {"level": "servo", "what": "setpoint", "joints": HOME[:5]},
-        f"joints = {HOME[:5]}: 5 values; permitted: 6, one per joint: j1, j2, j3, j4, j5, j6",
+        f"joints = {HOME[:5]}: 5 values; must be 6, one per joint: j1, j2, j3, j4, j5, j6",
     ),
     (
         {"level": "servo", "what": "setpoint", "joints": [9.0, *HOME[1:]]},
-        "joints = 9.0: out of range for joint 'j1'; permitted: -2.78753 to 2.78753 rad",
+        "joints = 9.0: out of range; joint 'j1' must be -2.78753 to 2.78753 rad",
     ),
     (
         {"level": "task", "what": "hold", "tick": 4, "at": 1.0},
-        "at = 1.0: tick is also given; permitted: one of tick, at",
+        "at = 1.0: tick is also given; give only one of tick, at",
     ),
     (
         {"level": "task", "what": "hold", "name": "x"},
@@ -132,7 +132,7 @@ def test_no_more_commands_than_the_table_holds_can_wait(nasrem: RackConfig) -> N
     (found,) = command_mistakes([hold] * (OPERATOR_ENTRIES + 1), nasrem, levels)
     many = OPERATOR_ENTRIES + 1
     assert str(found) == (
-        f"command = {many}: too many pending commands; permitted: {OPERATOR_ENTRIES}"
+        f"command = {many}: too many commands; at most {OPERATOR_ENTRIES} may be pending"
     )
 
 

@@ -166,7 +166,8 @@ def test_an_endless_chain_of_files_is_refused(write: Write) -> None:
     for at in range(40):
         write(f"chain{at}.toml", f'extends = ["chain{at + 1}.toml"]\n')
     with pytest.raises(
-        ConfigError, match=r"chain32.toml: extends: chain of extends too long; permitted: 32 files$"
+        ConfigError,
+        match=r"chain32.toml: extends: the chain of extended files is longer than 32 files$",
     ):
         load(write("chain40.toml", "").with_name("chain0.toml"))
 
@@ -202,7 +203,9 @@ def test_a_fifo_or_a_device_in_place_of_a_file_is_refused_at_once(
 def test_an_impossible_file_name_is_reported_as_missing(
     small: Path, write: Write, name: str
 ) -> None:
-    with pytest.raises(ConfigError, match=r"^config = .*: no such file; by name: ") as error:
+    with pytest.raises(
+        ConfigError, match=r"^config = .*: no such file; valid are a path or one of the names "
+    ) as error:
         load(name)
     assert len(lines(error)[0]) - len(", ".join(names())) < 160, (
         "it is cut, apart from the names of racks"

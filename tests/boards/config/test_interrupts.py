@@ -62,10 +62,7 @@ def test_a_message_costs_its_words_and_interrupts_other_boards_only(small: Path)
     [
         (
             "board.hub.exchange.below.asynchronous=true",
-            (
-                "the messages of 'figure0.status' interrupt the board as they come already;"
-                " permitted: false"
-            ),
+            ("the messages of 'figure0.status' already interrupt the board; must be false"),
         ),
     ],
 )
