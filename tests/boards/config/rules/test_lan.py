@@ -78,9 +78,9 @@ def test_a_malformed_endpoint_is_one_line(tmp_path: Path, endpoint: str, why: st
 
 def test_tls_needs_certificates(tmp_path: Path) -> None:
     (line,) = mistakes(tmp_path, TLS)
-    assert (
-        line
-        == "adapter.lan.certificates: missing; TLS needs certificates: see rack lan certificates --help"
+    assert line == (
+        "adapter.lan.certificates: missing; TLS needs certificates: see rack lan certificates"
+        " --help"
     )
 
 

@@ -50,8 +50,8 @@ MISTAKES = {
     "a mailbox of the adapter": (
         ["adapter.lan.export.again={ from = 'lan.other' }"],
         (
-            'adapter.lan.export.again.from = "lan.other": written by the adapter itself; permitted:'
-            " mailboxes that"
+            'adapter.lan.export.again.from = "lan.other": the adapter itself writes it; only mailboxes'
+            " of levels can be exported"
         ),
     ),
     "a queue": (
@@ -133,7 +133,10 @@ MISTAKES = {
     ),
     "a board of its name": (
         ["board.lan={ slot = 9, rate_hz = 50, executor = 'lan_levels:Pulse' }"],
-        "board.lan: [adapter.lan] adds a board of this name; rename this board, or remove one of them",
+        (
+            "board.lan: [adapter.lan] adds a board of this name; rename this board, or remove one"
+            " of them"
+        ),
     ),
     "a board that is the adapter": (
         ["board.net={ slot = 9, rate_hz = 50, executor = 'rack.boards.lan.adapter:LanAdapter' }"],
