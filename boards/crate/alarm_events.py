@@ -94,7 +94,7 @@ TEXTS: Mapping[About, Mapping[Alarm, str]] = {
         Alarm.HELD_BACK: "'{subject}': a message was delayed by {span}",
         Alarm.DISORDER: "'{subject}': messages out of order, the last one by {span}",
         Alarm.DAMAGED: "'{subject}': a message failed its check",
-        Alarm.BABBLE: "'{subject}': '{writer}' writes {value:g} messages per cycle; permitted: 1",
+        Alarm.BABBLE: "'{subject}': '{writer}' writes {value:g} messages per cycle instead of 1",
         Alarm.MASQUERADE: (
             "'{subject}': a message comes from process {value:.0f}, which is not its writer"
         ),
@@ -298,7 +298,7 @@ class AlarmEvents:
         )
         tick = found_at = int(row["tick"])
         if alarm == Alarm.BRAKES_CLOSED and since < found_at:
-            # If brakes engaged while no board drove the arm, this is known only when one does again.
+            # Brakes that engage while no board drives the arm are reported once a board drives it.
             tick = since
             text += f", known at tick {found_at}"
         return Event(

@@ -175,7 +175,7 @@ class Recovery:
         self._journal.add("detection", "rack", text, "hang", subject=board)
 
     def end_hanging(self, board: str) -> None:
-        """Kill a hanging board, so that it is lost. A board that is being restarted is not killed."""
+        """Kill a hanging board, so that it is lost, unless it is already being restarted."""
         if board not in (*self._waiting, *self._starting):
             self._crate.ask(PowerOff(board))
 

@@ -33,7 +33,7 @@ def test_what_is_not_there_is_said(small: Path) -> None:
     with OneProcess.from_file(small) as rack:
         with pytest.raises(LookupError, match=r"^'lower\.status' is empty at tick -1$"):
             rack.newest("lower.status")
-        with pytest.raises(LookupError, match=r"^no mailbox 'lower'; there are: .*lower\.status"):
+        with pytest.raises(LookupError, match=r"^no mailbox 'lower'; mailboxes: .*lower\.status"):
             rack.newest("lower")
 
 

@@ -152,13 +152,13 @@ def test_a_forecast_notes_what_it_leaves_out_and_nothing_else() -> None:
     notes = Forecast.of(replace(counted, is_lockstep=True, speed=2.0), has_cores=False).notes
     expected = (
         "in lockstep",
-        "times are of the wall clock: speed 2",
+        "times are wall-clock times: speed 2",
         "cores are those of the config",
     )
     assert len(notes) == len(expected)
     assert all(note.startswith(start) for note, start in zip(notes, expected, strict=True))
     queued = Forecast.of(arm_of(*JOINTS).changed("path", queues=("plan.requests",))).notes
-    assert queued[0] == "the system's response is that of empty queues: plan.requests"
+    assert queued[0] == "the system response assumes that these queues are empty: plan.requests"
     # Without a budget there is nothing to say about times.
     bare = Forecast.of(
         replace(rack(board("bare", 4)), is_lockstep=True, speed=2.0), has_cores=False

@@ -86,7 +86,7 @@ MISTAKES = {
     ),
     "a name of an entry": (
         ["board.bridge.params.pass.status={ from = 'adder.status' }"],
-        "pass.status: invalid name; permitted: a-z, 0-9 and _, except status, ",
+        "pass.status: invalid name; valid: a-z, 0-9 and _, except status, ",
     ),
     "a fault": (
         ["host.program.external=true", "fault=[{ kind = 'kill', board = 'program', tick = 1 }]"],
