@@ -119,8 +119,13 @@ def command_mistakes(
         for mistake in _mistakes(place, command, config, levels)
     ]
     if len(placed) > OPERATOR_ENTRIES:
-        why = f"too many commands; at most {OPERATOR_ENTRIES} may be pending"
-        mistakes.append(Mistake("command", len(placed), why))
+        mistakes.append(
+            Mistake(
+                "command",
+                len(placed),
+                f"too many commands; at most {OPERATOR_ENTRIES} may be pending",
+            )
+        )
     return mistakes
 
 
@@ -167,8 +172,9 @@ def _goal(at: Callable[[str], str], command: CommandConfig, known: Commands) -> 
         why = "missing" if not goals else f"several given: {goal_names(goals)}"
         yield Mistake(at("goal"), None, f"{why}; {what} takes one of: {goal_names(accepted)}")
     elif goals[0] not in accepted:
-        why = f"not a goal for {what}; valid goals: {goal_names(accepted)}"
-        yield Mistake(at(_key(goals[0])), None, why)
+        yield Mistake(
+            at(_key(goals[0])), None, f"not a goal for {what}; valid goals: {goal_names(accepted)}"
+        )
     elif command.position is None and goals[0] in (Goal.POSE, Goal.DIRECTION):
         yield Mistake(at("position"), None, "missing; tool position, m")
     elif command.quaternion is not None and command.direction is not None:
@@ -189,7 +195,7 @@ def _name(place: str, command: CommandConfig, level: PublishedLevel) -> Mistakes
             yield Mistake(place, command.name, f"{command.what} takes no name; remove it")
         return
     known = level.wording.get(command.said)
-    # If the level's names are unknown, its own mistakes are the reason and are reported there.
+    # The names are unknown if the level's table has mistakes, which are reported separately.
     if known is not None and command.name not in known:
         yield Mistake(
             place,
@@ -238,5 +244,6 @@ def _joints(place: str, joints: tuple[float, ...], config: RackConfig) -> Mistak
         return
     for name, value, (low, high) in zip(robot.joints, joints, ranges, strict=True):
         if not low <= value <= high:
-            why = f"out of range; joint '{name}' must be {low:g} to {high:g} rad"
-            yield Mistake(place, value, why)
+            yield Mistake(
+                place, value, f"out of range; joint '{name}' must be {low:g} to {high:g} rad"
+            )

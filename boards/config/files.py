@@ -123,7 +123,7 @@ def with_faults(tables: Tables, name_or_path: str | Path, folder: Path) -> Table
 
 
 def names(folder: Path = CONFIGS) -> list[str]:
-    """Return the names of the configs in a folder. By default, those of the bundled racks.
+    """Return the names of the configs in a folder. The default is the folder of bundled racks.
 
     The config `<name>` is the file `<name>.toml` or `<name>/<name>.toml`. Further files in that
     subfolder that contain the key `name` are racks too, called `<name>/<file>`.
@@ -149,7 +149,7 @@ def file_at(path: Path) -> Path | None:
         path = path.expanduser()
         if path.is_file():
             return path.resolve()
-        # Do not follow links here: the file may be a link to a device.
+        # Do not resolve links, because the file may be a link to a device.
         return path.absolute() if path.exists() and not path.is_dir() else None
     except (OSError, RuntimeError, ValueError):
         return None
@@ -260,7 +260,7 @@ def _merged(
 
 
 def _extended(base: Tables, top: Tables) -> Tables:
-    """Return `base` updated with `top`. A `[robot]` with a model of its own replaces the arm."""
+    """Return `base` updated with `top`. A `[robot]` that names a model replaces the whole arm."""
     if "model" in _table(top, "robot"):
         base = {key: value for key, value in base.items() if key != "robot"}
     return merge(base, top)

@@ -46,8 +46,9 @@ def fault_mistakes(
     ]
     mistakes = [mistake for rule in rules for mistake in rule.mistakes()]
     if len(rules) > FAULT_ENTRIES:
-        why = f"too many faults; a run can have at most {FAULT_ENTRIES}"
-        mistakes.append(Mistake("fault", len(rules), why))
+        mistakes.append(
+            Mistake("fault", len(rules), f"too many faults; a run can have at most {FAULT_ENTRIES}")
+        )
     return mistakes
 
 

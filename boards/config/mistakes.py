@@ -58,8 +58,8 @@ def _mistake(entry: ErrorDetails, model: type[BaseModel], tables: Any, place: st
         context = entry["ctx"]
         valid = context.get("expected_tags", "").replace("'", "")
         why = f"valid values: {valid}" if valid else "missing; it selects the kind of table"
-        key = context["discriminator"].strip("'")
-        return Mistake(f"{where}.{key}", context.get("tag"), why)
+        # pydantic puts the name of the key in quotes.
+        return Mistake(f"{where}.{context['discriminator'][1:-1]}", context.get("tag"), why)
     known, field = _declared(model, keys, tables)
     meaning = f"; {field.description}" if field is not None and field.description else ""
     if entry["type"] == "missing":

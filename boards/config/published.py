@@ -1,8 +1,8 @@
 """Facts about the levels of a rack, published as plain data for tools.
 
-They are gathered from the levels' classes at the launch and stored as text in the segment and in
-run folders. Tools that show or command a rack read them there. They never import the classes that
-a config names, because that would run code of whoever wrote the config.
+The launch gathers them from the levels' classes and stores them as text in the segment and in run
+folders. Tools that show or command a rack read this text. They never import the classes that a
+config names, because that would run code of whoever wrote the config.
 """
 
 from __future__ import annotations

@@ -120,7 +120,7 @@ def find_tables(name: str, config: RackConfig) -> list[KeyTable]:
     if (
         parts[0] in ("board", "host")
         and len(parts) > 1
-        and (parts[1] in (*getattr(config, parts[0]), "<name>"))
+        and parts[1] in (*getattr(config, parts[0]), "<name>")
     ):
         # The keys that all boards have in common are described once, without a name.
         tables.append(".".join(parts[:1] + parts[2:]))

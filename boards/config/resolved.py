@@ -318,7 +318,7 @@ class Examination:
                 below={other: paces[other] for other in board.below},
             )
             for name, board in boards.items()
-            # Omit boards whose neighbours have mistakes, which are reported there.
+            # Omit boards whose neighbours are missing because of mistakes.
             if boards.keys() >= {*board.above, *board.below}
         }
 

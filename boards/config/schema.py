@@ -103,7 +103,7 @@ class ClockConfig(Table):
     core: Core = 0
     """core of the system controller"""
     priority: Priority = 0
-    """SCHED_FIFO priority of the system controller; 0: ordinary scheduling"""
+    """SCHED_FIFO priority of the system controller; 0 means ordinary scheduling"""
 
 
 class TimingConfig(Table):
@@ -179,7 +179,7 @@ class SupervisionConfig(Table):
     """
 
     restarts: Restarts = 5
-    """maximum number of restarts of one task within within_s; 0: never restart"""
+    """maximum number of restarts of one task within within_s; with 0 it is never restarted"""
     within_s: Positive = 10.0
     """time window in which restarts are counted [s]; simulated time"""
     lockstep_restart_s: Positive = 0.5
@@ -203,7 +203,7 @@ class PlacedConfig(Table):
     core: Core = 0
     """core of the board; another core is used if the machine does not have it"""
     priority: Priority = 0
-    """SCHED_FIFO priority of the executor; 0: ordinary scheduling"""
+    """SCHED_FIFO priority of the executor; 0 means ordinary scheduling"""
     budget: BudgetConfig | None = None
     """worst-case processor times, for the timing model"""
     restarts: Restarts | None = None
@@ -240,7 +240,7 @@ class BoardConfig(PlacedConfig):
     planner_core: Core | None = None
     """core of a loosely coupled planner; default: the board's core"""
     planner_priority: Priority = 0
-    """SCHED_FIFO priority of the planner; 0: ordinary scheduling"""
+    """SCHED_FIFO priority of the planner; 0 means ordinary scheduling"""
     reads: dict[str, Sources] = {}
     """mailbox by port of the executor, or a list; overrides the sources that the level declares"""
     planner_reads: dict[str, Sources] = {}
@@ -260,10 +260,10 @@ class BoardConfig(PlacedConfig):
     @property
     def busy_ms(self) -> float:
         """Processor time of one executor cycle by the budget, ms. 0 without a budget."""
-        times = self.budget
-        if times is None:
+        cost = self.budget
+        if cost is None:
             return 0.0
-        return times.exchange_ms + times.read_ms + times.process_ms + times.write_ms
+        return cost.exchange_ms + cost.read_ms + cost.process_ms + cost.write_ms
 
 
 LAN = "lan"
@@ -421,8 +421,8 @@ class RackConfig(Table):
     """Config of a rack: everything that a run depends on."""
 
     format: int = Field(1, ge=1, le=FORMAT)
-    """format of this config; 2: as described here; 1: from before rack 0.2, see the notes of a
-    launch"""
+    """format of this config; 2 is described on this page; 1 is from before rack 0.2, and a launch
+    notes the differences"""
     name: RackName
     """name of the rack and of its shared memory: at most 40 of a-z, 0-9, - and _"""
     seed: int = Field(0, ge=0, le=2**31 - 1)

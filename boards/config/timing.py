@@ -172,6 +172,11 @@ def is_critical(config: RackConfig, layout: Layout, board: str) -> bool:
     """Return True if a board's plan update is the paper's critical section.
 
     That is the case for a tightly coupled planner under protocol lock.
+
+    Args:
+        config: The config of the rack.
+        layout: Its layout.
+        board: Name of the board.
     """
     return (
         config.board[board].coupling == "tight"

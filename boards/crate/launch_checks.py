@@ -1,4 +1,4 @@
-"""What the machine permits a rack that is being launched: refusals, and notes for the user."""
+"""Checks of the machine's limits during a launch, and the notes that the launch reports."""
 
 from __future__ import annotations
 
@@ -19,9 +19,7 @@ _PERMIT = (
     " and log in again (ulimit -{} shows the limit), or grant {}"
 )
 PERMIT = _PERMIT.format("rtprio 99", "r", "CAP_SYS_NICE")
-"""How a user obtains real-time priorities."""
-PERMIT_LOCK = _PERMIT.format("memlock unlimited", "l", "CAP_IPC_LOCK")
-"""How a user obtains the right to lock memory."""
+"""Advice on obtaining real-time priorities."""
 FILES = 32
 """Files that a process of a rack may open, in addition to one for each process and mailbox."""
 
@@ -45,13 +43,16 @@ def check_realtime(plan: Resolved, segment: Segment) -> None:
 def list_launch_notes(plan: Resolved, segment: Segment) -> Iterator[str]:
     """Yield what a launch reports: replaced cores, refused priorities and other limits."""
     config = plan.config
-    yield from config.changed
-    yield from shared_out(config)
+    yield from (*config.changed, *shared_out(config))
     if (network := network_rules(config)) is not None:
         yield from network.list_network_notes(config)
     if config.is_lockstep:
-        why = "sends enters at ticks that depend on its timing; --entries RUN repeats a run"
-        yield from (f"what {host.board} {why}" for host in plan.hosts if host.is_external)
+        yield from (
+            f"messages of {host.board} enter at ticks that depend on its timing; --entries RUN"
+            " repeats a run"
+            for host in plan.hosts
+            if host.is_external
+        )
         return
     if refusal := _find_refusal(plan, segment):
         yield f"{refusal}; missed deadlines are likely. {PERMIT}"
@@ -65,7 +66,8 @@ def list_launch_notes(plan: Resolved, segment: Segment) -> Iterator[str]:
         yield (
             f"memory not locked for {', '.join(unlocked)}: the limit is"
             f" {getrlimit(RLIMIT_MEMLOCK)[0]} bytes, a board maps {max(unlocked.values())};"
-            f" page faults may delay cycles. {PERMIT_LOCK}"
+            " page faults may delay cycles."
+            f" {_PERMIT.format('memlock unlimited', 'l', 'CAP_IPC_LOCK')}"
         )
     if config.clock.idle_cores == "awake":
         with cores_kept_awake() as refusal:
@@ -73,7 +75,7 @@ def list_launch_notes(plan: Resolved, segment: Segment) -> Iterator[str]:
 
 
 def _find_refusal(plan: Resolved, segment: Segment) -> str:
-    """Return which tasks were refused their priority. Empty if none; lockstep has no deadlines."""
+    """Return which tasks were refused their priority. Empty if none, or in lockstep."""
     refused = [
         task.name
         for task in plan.layout.tasks

@@ -1,6 +1,6 @@
 """All levels of a rack in one process, which calls `process` and `plan` of each in turn.
 
-Use it to test a level of your own, or to measure the work of the levels without the rack:
+Use it to test your own level, or to measure the work of the levels without the rack:
 
     from rack.boards import OneProcess
 
@@ -203,8 +203,8 @@ class LoneTask:
         )
         kind.preload()
         self.level = level = kind(wiring.context)
-        # Where each reading is stored: the table of the level's ports, or the dict of a port that
-        # reads several mailboxes.
+        # Table, key and function of each reading. The table belongs to the level's ports, or to one
+        # port that reads several mailboxes.
         self._readers: list[tuple[dict[str, Any], str, Callable[[int], Reading[Message]]]] = []
         for port, source in wiring.inputs.items():
             message = level.inputs[port].message if port in level.inputs else AnyMessage

@@ -19,12 +19,8 @@ from rack.boards.config.commands import asked, request
 from rack.boards.config.loader import load
 from rack.boards.config.resolved import Resolved, classes, resolve
 from rack.boards.config.schema import RackConfig
+from rack.boards.crate import launch_checks
 from rack.boards.crate.clean import remove_dead, remove_own
-from rack.boards.crate.launch_checks import (
-    check_open_files,
-    check_realtime,
-    list_launch_notes,
-)
 from rack.boards.crate.line import CrateLine
 from rack.boards.crate.neighbours import conflicts, holders, placed
 from rack.boards.crate.patience import await_opened
@@ -166,7 +162,7 @@ class Rack:
                 why = "they are taken in lockstep; add --lockstep"
             if why:
                 raise SnapshotError(f"rack '{self.config.name}' has no snapshots: {why}")
-        check_open_files(plan)
+        launch_checks.check_open_files(plan)
         remove_dead(self.config.name)
         segment = Segment.create(plan.layout, self.config.text(), plan.published.text())
         self._journal.segment = segment
@@ -192,9 +188,9 @@ class Rack:
         for wiring in plan.tasks:
             crate.send(PowerOn(wiring.task, wiring))
         supervisor.await_ready(LAUNCH_S)
-        check_realtime(plan, segment)
+        launch_checks.check_realtime(plan, segment)
         self._inject(plan, crate)
-        for note in (*moved, *list_launch_notes(plan, segment)):
+        for note in (*moved, *launch_checks.list_launch_notes(plan, segment)):
             self._journal.add("ready", "", note)
 
     def _inject(self, plan: Resolved, crate: CrateLine) -> None:

@@ -102,8 +102,8 @@ class HostBus:
             self.close()
             raise
         self._semaphore = wake_semaphore(segment, wiring.board)
-        # Faults send signals to this process id. In another PID namespace they would strike another
-        # process, so it is not published there.
+        # Faults send signals to this process id. If the program runs in another PID namespace, they
+        # would strike another process, so no id is published.
         self.block[Block.PID] = os.getpid() if segment.launcher else 0
         self.block[Block.WAITS_UNTIL] = 0
         self.block[Block.STATE] = TaskState.RUNNING
@@ -180,11 +180,10 @@ class HostBus:
             LookupError: The bus has neither of this name.
         """
         places = self._segment.map
-        addresses = {**places.blocks, **places.mailboxes}
-        if name not in addresses:
-            known = ", ".join(addresses)
-            raise LookupError(f"nothing on the bus is called '{name}'; known: {known}")
-        return addresses[name]
+        known = {**places.blocks, **places.mailboxes}
+        if name not in known:
+            raise LookupError(f"nothing on the bus is called '{name}'; known: {', '.join(known)}")
+        return known[name]
 
     def words(self, address: int, count: int = 1) -> list[int]:
         """Read words of the crate's memory.

@@ -225,7 +225,7 @@ class HostTurn(ReleasedTask):
             if time.monotonic() > bound_s:
                 raise CannotGoOn(
                     f"the program of host board '{self.spec.name}' has not waited for {LONGEST_S:g}"
-                    " s of real time: lockstep cannot go on without it"
+                    " s of real time, and lockstep cannot continue without it"
                 )
         if block[Block.LOST]:
             # The crate has recorded the tick of the clock, which may be later than this cycle.

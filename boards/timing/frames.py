@@ -33,7 +33,7 @@ class FramePlace:
         limit_ns: Time at which it must be done.
         slack_ns: Time from its end to the limit, ns. If negative, the work that is left at the
             limit.
-        until: Board that begins at the limit. Empty if the frame ends there.
+        until: Board that begins at the limit. Empty if the frame ends at the limit.
     """
 
     board: str
@@ -120,7 +120,7 @@ def _places(tasks: Sequence[TimedTask], work: Work, start: int, minor: int) -> I
         is_last = not later or later[0][0] > release
         spans = work[board, release]
         done = sum(min(s.end_ns, limit) - s.start_ns for s in spans if s.start_ns < limit)
-        # A job that is not done by the limit counts as ending there.
+        # A job that is not done by the limit counts as ending at the limit.
         end = spans[-1].end_ns if done == cost_ns else limit
         begins = max(begins, release)
         yield FramePlace(

@@ -171,8 +171,9 @@ def record(wiring: Wiring) -> Mistakes:
     if table.keep is None:
         for key in ("before", "after"):
             if (value := getattr(table, key)) != RecordConfig.model_fields[key].default:
-                why = "this needs record.keep; without it everything is kept"
-                yield Mistake(f"record.{key}", value, why)
+                yield Mistake(
+                    f"record.{key}", value, "this needs record.keep; without it everything is kept"
+                )
 
 
 LONGEST_MAJOR = 10_000
@@ -283,8 +284,10 @@ def _frames(table: ScheduleConfig, clock_ns: int) -> Mistakes:
         why = f"not a multiple of minor_ms, {table.minor_ms:g} ms; nearest: {near} ms"
         yield Mistake("schedule.major_ms", table.major_ms, why)
     elif major > LONGEST_MAJOR:
-        longest = f"{LONGEST_MAJOR} ticks, {LONGEST_MAJOR * tick_ms:g} ms"
-        why = f"{major} ticks are too long; the longest major frame is {longest}"
+        why = (
+            f"{major} ticks are too long; the longest major frame is {LONGEST_MAJOR} ticks,"
+            f" {LONGEST_MAJOR * tick_ms:g} ms"
+        )
         yield Mistake("schedule.major_ms", table.major_ms, why)
 
 

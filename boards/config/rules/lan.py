@@ -244,7 +244,7 @@ def _why_not(endpoint: Endpoint, table: LanTable, connects: bool) -> str:
         )
     if table.certificates is None:
         return (
-            "every user of this machine could impersonate any rack here; use unix/ and a name or"
+            "every user of this machine could impersonate another rack; use unix/ and a name or"
             f" certificates, which protect messages, or accept it with {PLACE}.insecure = true"
         )
     return ""

@@ -129,12 +129,12 @@ def strict(wiring: Wiring) -> Mistakes:
         return
     why = "makes a run depend on timing, which protocol.strict = true refuses; must be"
     if config.protocol.default not in BY_TICKS:
-        default = config.protocol.default
-        yield Mistake("protocol.default", default, f"{why} time-slice or interrupt")
+        yield Mistake("protocol.default", config.protocol.default, f"{why} time-slice or interrupt")
     for mailbox, protocol in config.protocol.mailbox.items():
         if protocol not in BY_TICKS:
-            valid = ", ".join(BY_TICKS)
-            yield Mistake(f"protocol.mailbox.{mailbox}", protocol, f"{why} one of {valid}")
+            yield Mistake(
+                f"protocol.mailbox.{mailbox}", protocol, f"{why} one of {', '.join(BY_TICKS)}"
+            )
     for name in config.host:
         yield Mistake(f"host.{name}", None, f"a board without real time {why} a board with a rate")
     for name, board in config.board.items():
@@ -181,8 +181,11 @@ def operated(wiring: Wiring) -> Mistakes:
             )
         protocol = wiring.config.protocol.mailbox.get(mailbox)
         if why := NOT_OPERATED.get(protocol or ""):
-            why += "; must be time-slice or double-buffer"
-            yield Mistake(f"protocol.mailbox.{mailbox}", protocol, why)
+            yield Mistake(
+                f"protocol.mailbox.{mailbox}",
+                protocol,
+                f"{why}; must be time-slice or double-buffer",
+            )
 
 
 def mailboxes(wiring: Wiring) -> Mistakes:

@@ -96,8 +96,8 @@ def test_a_program_that_does_not_wait_ends_the_run_with_that_reason(config: Make
     assert (outcome.cause, outcome.worked) == ("board lost", False)
     (fault,) = outcome.faults
     assert fault.startswith(
-        "board 'bridge': the program of host board 'program' has not waited for 1 s of real time:"
-        " lockstep cannot go on"
+        "board 'bridge': the program of host board 'program' has not waited for 1 s of real time,"
+        " and lockstep cannot continue"
     )
 
 

@@ -153,7 +153,7 @@ def test_a_forecast_notes_what_it_leaves_out_and_nothing_else() -> None:
     expected = (
         "in lockstep",
         "times are wall-clock times: speed 2",
-        "cores are those of the config",
+        "cores are those in the config",
     )
     assert len(notes) == len(expected)
     assert all(note.startswith(start) for note, start in zip(notes, expected, strict=True))

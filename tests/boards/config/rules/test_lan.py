@@ -31,7 +31,7 @@ def mistakes(
 
 
 NEAR = (
-    "every user of this machine could impersonate any rack here; use unix/ and a name or"
+    "every user of this machine could impersonate another rack; use unix/ and a name or"
     " certificates, which protect messages, or accept it with adapter.lan.insecure = true"
 )
 FAR = (
