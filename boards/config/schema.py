@@ -69,8 +69,8 @@ FORMAT = 2
 """Newest format of configs, used since rack 0.2."""
 CHANGED = (
     'config format 1, from before rack 0.2: since then clock.idle_cores is "sleep" unless it is'
-    " given, and classes of levels have moved (old names still work); write format = 2 once"
-    " this suits you"
+    " given, and classes of levels have moved (old names still work); write format = 2 when"
+    " that suits you"
 )
 RESTART_S = 2.0
 """Longest time of a restart in real time. A planner with its libraries needs 1.5 s."""

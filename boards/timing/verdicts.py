@@ -218,7 +218,7 @@ def _of_tasks(rack: RackTiming) -> Iterator[EquationVerdict]:
 
 def _of_cores(rack: RackTiming) -> Iterator[EquationVerdict]:
     for core, load in rack.loads.items():
-        meaning = "share of its time in which its tasks compute"
+        meaning = "share of its time that its tasks compute"
         yield EquationVerdict(LOAD, f"core {core}", load, "<=", 1.0, meaning, "1")
 
 

@@ -41,7 +41,7 @@ def mistakes(config: RackConfig, broken: frozenset[str] = frozenset(), **given: 
         {"level": "servo", "what": "setpoint", "joints": HOME},
     ],
 )
-def test_what_is_permitted_has_no_mistakes(nasrem: RackConfig, given: dict[str, Any]) -> None:
+def test_a_valid_command_has_no_mistakes(nasrem: RackConfig, given: dict[str, Any]) -> None:
     assert mistakes(nasrem, **given) == []
 
 
@@ -117,7 +117,7 @@ def test_a_mistake_is_one_line(nasrem: RackConfig, given: dict[str, Any], line: 
     assert mistakes(nasrem, **given) == [line]
 
 
-def test_the_ends_of_a_joints_range_are_permitted(nasrem: RackConfig) -> None:
+def test_the_limits_of_a_joints_range_are_valid(nasrem: RackConfig) -> None:
     robot = nasrem.robot
     assert robot is not None
     ends = built_cell(nasrem).limits.position.T.tolist()
@@ -125,7 +125,7 @@ def test_the_ends_of_a_joints_range_are_permitted(nasrem: RackConfig) -> None:
         assert mistakes(nasrem, level="servo", what="setpoint", joints=joints) == []
 
 
-def test_no_more_commands_than_the_table_holds_can_wait(nasrem: RackConfig) -> None:
+def test_more_commands_than_the_table_has_entries_are_refused(nasrem: RackConfig) -> None:
     hold = ("", asked({"level": "task", "what": "hold"}))
     levels = publish(nasrem).levels
     assert command_mistakes([hold] * OPERATOR_ENTRIES, nasrem, levels) == []
@@ -136,7 +136,7 @@ def test_no_more_commands_than_the_table_holds_can_wait(nasrem: RackConfig) -> N
     )
 
 
-def test_a_modification_is_put_in_or_taken_out_by_its_name(gentle: RackConfig) -> None:
+def test_a_modification_is_added_or_removed_by_name(gentle: RackConfig) -> None:
     def of(**given: Any) -> list[str]:
         return mistakes(gentle, level="servo", what="modify", **given)
 
@@ -150,7 +150,7 @@ def test_a_modification_is_put_in_or_taken_out_by_its_name(gentle: RackConfig) -
     assert "name" in unnamed
 
 
-def test_of_a_broken_board_only_its_own_mistakes_are_said(nasrem: RackConfig) -> None:
+def test_commands_to_a_broken_board_are_not_checked(nasrem: RackConfig) -> None:
     broken = frozenset({"task"})
     assert mistakes(nasrem, broken, level="task", what="goto") == []
     assert len(mistakes(nasrem, broken, level="servo", what="goto")) == 1

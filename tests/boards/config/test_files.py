@@ -70,7 +70,9 @@ def test_an_unknown_name_gets_the_nearest_known_one() -> None:
     assert lines(error) == ["config = \"nasrm\": no such file; did you mean 'nasrem'?"]
 
 
-def test_a_file_says_its_own_format_whatever_it_extends(small: Path, write: Write) -> None:
+def test_the_format_of_a_file_does_not_depend_on_the_files_it_extends(
+    small: Path, write: Write
+) -> None:
     older = load(write("older.toml", 'name = "mine"\nextends = ["small.toml"]\n'))
     newer = load(write("newer.toml", 'format = 2\nname = "mine"\nextends = ["older.toml"]\n'))
     assert (load(small).format, older.format, newer.format) == (2, 1, 2)
@@ -107,7 +109,7 @@ def test_an_arm_is_replaced_as_a_whole(write: Write) -> None:
     assert config.robot.model == model.resolve()
 
 
-def test_an_arm_without_a_model_of_its_own_is_merged_as_every_table_is(write: Write) -> None:
+def test_a_robot_table_without_a_model_is_merged_like_any_table(write: Write) -> None:
     config = load(
         write(
             "mine.toml", 'extends = ["nasrem"]\n[robot]\nsubsteps = 8\n[scene]\nclearance = 0.03\n'
@@ -153,7 +155,7 @@ VALUES = {
 
 
 @pytest.mark.parametrize(("value", "expected"), VALUES.values(), ids=VALUES)
-def test_values_that_no_config_has_are_refused_in_files_and_settings(
+def test_values_that_no_config_may_have_are_refused_in_files_and_settings(
     write: Write, small: Path, value: str, expected: str
 ) -> None:
     with pytest.raises(ConfigError, match=f"^odd.toml: {expected}"):
@@ -254,7 +256,7 @@ def test_every_impossible_override_is_reported(small: Path) -> None:
     ]
 
 
-def test_a_fault_script_by_name_is_the_racks_own_before_a_bundled_one(write: Write) -> None:
+def test_a_fault_script_of_the_rack_precedes_a_bundled_one_of_the_same_name(write: Write) -> None:
     rack = write("mine.toml", 'name = "mine"')
     bundled = assembled(rack, (), "overload").tables["fault"]
     write("overload.toml", "[[fault]]\nkind = 'kill'\nboard = 'lower'\ntick = 5")
@@ -270,7 +272,7 @@ def test_classes_are_found_in_tables_that_have_not_been_checked() -> None:
     assert named_classes({"board": [1]}) == named_classes({}) == ()
 
 
-def test_a_name_may_be_that_of_a_config_in_the_current_folder(
+def test_a_config_in_the_current_folder_is_found_by_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "mine").mkdir()

@@ -165,7 +165,7 @@ def test_a_key_that_a_kind_cannot_have_is_one_mistake(kind: Kind) -> None:
             assert said.startswith(why.format(kind.name))
 
 
-def test_a_parameter_that_a_kind_lacks_lists_those_it_has() -> None:
+def test_an_unknown_parameter_of_a_fault_is_reported_with_the_known_ones() -> None:
     names = ", ".join(parameter.name for parameter in KINDS["drop"].parameters)
     assert mistake_of(KINDS["drop"], strength=2).endswith(f"parameters: {names}")
 
@@ -210,7 +210,7 @@ def test_a_lock_is_held_only_where_the_mailbox_has_one(config: MakeConfig) -> No
     wire(rack(config, fault, settings=(LOCKED,)))
 
 
-def test_a_joint_that_the_arm_lacks_is_refused() -> None:
+def test_a_joint_that_the_arm_does_not_have_is_refused() -> None:
     settings = ['fault=[{ kind = "sensor-nan", board = "servo", joint = 6 }]']
     with pytest.raises(
         ConfigError,

@@ -66,7 +66,7 @@ def test_a_message_costs_its_words_and_interrupts_other_boards_only(small: Path)
         ),
     ],
 )
-def test_what_does_not_fit_is_refused(setting: str, why: str) -> None:
+def test_an_asynchronous_port_with_interrupts_is_refused(setting: str, why: str) -> None:
     with pytest.raises(ConfigError) as error:
         resolve(validated(Assembled(override(parse(RACK), [setting], []))))
     assert why in str(error.value)

@@ -58,7 +58,7 @@ def test_the_crate_is_below_every_real_time_executor(
     ],
     ids=["without locks", "locks on one core", "locks on two boards"],
 )
-def test_a_planner_that_may_hold_a_lock_has_its_executors_priority_meanwhile(
+def test_a_planner_runs_at_its_executors_priority_while_it_may_hold_a_lock(
     small: Path, settings: list[str], expected: int
 ) -> None:
     priorities = ["board.lower.priority=50", "board.upper.priority=40"]
@@ -72,7 +72,7 @@ def test_a_planner_that_may_hold_a_lock_has_its_executors_priority_meanwhile(
     assert [task.task for task in plan.tasks if task.guards_clock] == ["lower"]
 
 
-def test_in_lockstep_the_clock_is_on_the_core_of_the_fastest_board_that_gives_it_away(
+def test_in_lockstep_the_clock_shares_the_core_of_the_fastest_board_that_yields(
     small: Path,
 ) -> None:
     cores = ["clock.core=0", "board.upper.core=0", "board.lower.core=1"]

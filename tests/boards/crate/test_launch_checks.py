@@ -30,7 +30,7 @@ def memory(config: MakeConfig) -> Iterator[tuple[Resolved, Segment]]:
     segment.close()
 
 
-def test_a_priority_that_was_refused_is_noted_and_refuses_the_launch_if_asked(
+def test_a_refused_priority_is_noted_and_ends_the_launch_if_configured(
     memory: tuple[Resolved, Segment], config: MakeConfig
 ) -> None:
     plan, segment = memory
@@ -49,7 +49,7 @@ def test_a_priority_that_was_refused_is_noted_and_refuses_the_launch_if_asked(
     assert not [note for note in list_launch_notes(stepped, segment) if "SCHED_FIFO" in note]
 
 
-def test_memory_that_could_not_be_locked_is_said_with_its_limit(
+def test_memory_that_is_not_locked_is_noted_with_its_limit(
     memory: tuple[Resolved, Segment], config: MakeConfig
 ) -> None:
     plan, segment = memory
@@ -64,7 +64,7 @@ def test_memory_that_could_not_be_locked_is_said_with_its_limit(
     assert not [note for note in in_lockstep if "not locked" in note]
 
 
-def test_a_launch_says_whether_idle_cores_are_held_awake(
+def test_a_launch_notes_whether_idle_cores_are_kept_awake(
     memory: tuple[Resolved, Segment], config: MakeConfig
 ) -> None:
     plan, segment = memory

@@ -74,7 +74,7 @@ def test_a_run_repeats_however_long_its_program_takes(
     assert slow(config, 0.0, *settings) == slow(config, 0.03, *settings)
 
 
-def test_a_program_that_is_done_is_not_struck_though_its_process_is_still_there(
+def test_a_fault_does_not_strike_a_finished_program_whose_process_still_exists(
     config: MakeConfig,
 ) -> None:
     settings = (

@@ -76,8 +76,8 @@ MISTAKES = {
     "both modes": (
         ["board.bridge.params.pass.numbers.every=2"],
         (
-            "board.bridge.params.pass.numbers: every = 2: the entry is asynchronous; permitted: one"
-            " of the two"
+            "board.bridge.params.pass.numbers: every = 2: the entry is also asynchronous; give only"
+            " one of the two"
         ),
     ),
     "a phase": (

@@ -49,7 +49,7 @@ FAR = (
         ("tcp/localhost.cell:7447", FAR),
     ],
 )
-def test_tcp_is_refused_unless_asked_for_by_name_or_sealed_on_loopback(
+def test_tcp_is_refused_unless_accepted_explicitly_or_protected_on_loopback(
     tmp_path: Path, endpoint: str, why: str
 ) -> None:
     assert mistakes(tmp_path, endpoint) == [f'adapter.lan.listen[0] = "{endpoint}": {why}']
@@ -84,7 +84,9 @@ def test_tls_needs_certificates(tmp_path: Path) -> None:
     )
 
 
-def test_flaws_of_all_files_come_with_the_other_mistakes(tmp_path: Path) -> None:
+def test_flaws_of_all_certificate_files_are_reported_with_the_other_mistakes(
+    tmp_path: Path,
+) -> None:
     (tmp_path / "certs").mkdir()
     lines = mistakes(tmp_path, TLS, 'certificates = "certs"', connect=("tcp/127.0.0.1:7448",))
     assert lines[0].startswith(
@@ -108,7 +110,7 @@ def test_certificates_are_found_next_to_the_config_from_anywhere(
     assert "cell.pem: not for address 127.0.0.2; for 127.0.0.1" in line
 
 
-def test_nobody_could_import_over_tls_without_being_named(tmp_path: Path) -> None:
+def test_exports_over_tls_need_named_peers(tmp_path: Path) -> None:
     make_credentials(tmp_path / "certs", {"cell": ["127.0.0.1"]}, 1)
     path = tmp_path / "rack.toml"
     path.write_text(rack_text("cell", TLS, (), lan='certificates = "certs"'))
@@ -124,7 +126,7 @@ def test_a_certificate_cannot_be_checked_for_an_address_of_ipv6(tmp_path: Path) 
     assert "use a host name or an IPv4 address" in line
 
 
-def test_a_launch_warns_of_certificates_that_end_soon(tmp_path: Path) -> None:
+def test_a_launch_warns_of_certificates_that_expire_soon(tmp_path: Path) -> None:
     for days, count in ((29, 1), (31, 0)):
         make_credentials(tmp_path / f"for{days}", {"cell": ["127.0.0.1"]}, days)
         assert mistakes(tmp_path, TLS, f'certificates = "for{days}"') == []
@@ -132,7 +134,7 @@ def test_a_launch_warns_of_certificates_that_end_soon(tmp_path: Path) -> None:
         assert [note.startswith("certificates expire on 20") for note in notes] == [True] * count
 
 
-def test_a_launch_without_tls_says_what_others_may_do(tmp_path: Path) -> None:
+def test_a_launch_without_tls_reports_possible_attacks(tmp_path: Path) -> None:
     make_credentials(tmp_path / "certs", {"cell": ["127.0.0.1"]}, 40)
     far, near, own = "tcp/10.0.0.1:7447", "tcp/127.0.0.1:7447", 'certificates = "certs"'
     read = "read messages, and pretend that racks come and go"
@@ -160,7 +162,7 @@ def test_a_launch_without_tls_says_what_others_may_do(tmp_path: Path) -> None:
         assert list_network_notes(load(tmp_path / "rack.toml")) == ([note] if note else [])
 
 
-def test_nobody_may_stop_a_rack_where_anyone_could_pass_for_another(tmp_path: Path) -> None:
+def test_remote_stops_are_refused_on_endpoints_that_allow_impersonation(tmp_path: Path) -> None:
     make_credentials(tmp_path / "certs", {"cell": ["127.0.0.1"]}, 1)
     lan, own = 'estop_from = ["operator"]', '\ncertificates = "certs"'
     for at, more, could in (

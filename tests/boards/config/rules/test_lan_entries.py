@@ -50,8 +50,8 @@ MISTAKES = {
     "a mailbox of the adapter": (
         ["adapter.lan.export.again={ from = 'lan.other' }"],
         (
-            'adapter.lan.export.again.from = "lan.other": the adapter itself writes it; only mailboxes'
-            " of levels can be exported"
+            'adapter.lan.export.again.from = "lan.other": the adapter itself writes it; only'
+            " mailboxes of levels can be exported"
         ),
     ),
     "a queue": (
@@ -177,7 +177,7 @@ def test_a_mistake_is_one_line(name: str) -> None:
     assert "board.lan." not in str(mistake)
 
 
-def test_what_is_permitted_is_permitted() -> None:
+def test_valid_tables_have_no_mistakes() -> None:
     resolved()
     resolved("protocol.strict=true")
     resolved("clock.mode=realtime", "adapter.lan.priority=41", "board.pulse.priority=40")
@@ -185,7 +185,7 @@ def test_what_is_permitted_is_permitted() -> None:
     resolved("adapter.lan.import.other.rate_hz=10", "adapter.lan.import.other.max_age_ms=120")
 
 
-def test_the_loss_of_the_adapter_is_as_bad_as_that_of_a_rack() -> None:
+def test_the_loss_of_the_adapter_has_the_same_reaction_as_the_loss_of_a_peer() -> None:
     for rule, on_loss in (("hold", "hold"), ("stop", "stop"), ("go on", "hold")):
         text = rack_text("one", "", [], "two", lan=f'on_peer_loss = "{rule}"')
         assert loads(text).board["lan"].on_loss == on_loss
@@ -228,7 +228,7 @@ def test_an_adapter_in_a_rack_without_boards_hides_no_mistake() -> None:
 
 
 @pytest.mark.slow
-def test_what_an_operator_commands_stays_in_its_rack(tmp_path: Path) -> None:
+def test_operator_commands_cannot_be_exported(tmp_path: Path) -> None:
     path = tmp_path / "arm.toml"
     table = '[adapter.lan]\nslot = 12\nlisten = ["tcp/127.0.0.1:7447"]\npeers = ["b"]\n'
     entry = '[adapter.lan.export.out]\nrate_hz = 10\nfrom = "{}"\n'

@@ -150,7 +150,7 @@ def test_a_mistake_is_reported_alone_with_place_value_and_what_is_permitted(
     assert expected in str(mistake)
 
 
-def test_names_that_a_model_lacks_are_reported_together_with_those_it_has(write: Write) -> None:
+def test_names_missing_in_a_model_are_reported_with_the_existing_ones(write: Write) -> None:
     text = """
 extends = ["nasrem"]
 [robot]
@@ -180,7 +180,7 @@ def test_a_config_whose_boards_are_all_wrong_still_has_its_other_mistakes_report
     }
 
 
-def test_a_mistake_is_one_line_whatever_its_key_holds(write: Write) -> None:
+def test_a_mistake_is_one_line_whatever_its_key_contains(write: Write) -> None:
     with pytest.raises(ConfigError) as error:
         load(
             write(
@@ -223,7 +223,7 @@ def test_a_segment_may_have_its_largest_size(
     ("setting", "place"),
     [("noise=[0, -1, 0, 0, 0, 0]", "noise[1]"), ("resolution=-1", "resolution")],
 )
-def test_a_value_of_several_possible_types_makes_one_mistake(setting: str, place: str) -> None:
+def test_an_invalid_value_of_a_union_is_one_mistake(setting: str, place: str) -> None:
     (mistake,) = mistakes("nasrem", f"robot.sensors.{setting}")
     assert (mistake.place, mistake.value) == (f"robot.sensors.{place}", -1)
 
@@ -255,7 +255,7 @@ STRICT = {
 
 
 @pytest.mark.parametrize(("setting", "place"), STRICT.values(), ids=STRICT)
-def test_what_depends_on_timing_is_refused_where_determinism_is_demanded(
+def test_settings_that_make_runs_depend_on_timing_are_refused_by_strict(
     small: Path, setting: str, place: str
 ) -> None:
     assert resolve(load(small, [setting]))
@@ -311,7 +311,7 @@ def test_every_mistake_of_parameters_is_reported() -> None:
     ]
 
 
-def test_a_level_that_declares_no_parameters_reads_what_it_likes(small: Path) -> None:
+def test_a_level_that_declares_no_parameters_accepts_any(small: Path) -> None:
     assert resolve(load(small, ["board.lower.params={ gain = 'high', deep = { on = true } }"]))
 
 
