@@ -109,20 +109,20 @@ def _connected(
     mistakes: list[Mistake] = []
     reads = dict(_connections(config, place, kind.inputs, mistakes))
     exchange: Mapping[str, ExchangeConfig] = {}
-    made = MadePorts()
+    added_ports = MadePorts()
     if issubclass(kind, Executor):
         board = config.board[place.board]
         exchange = board.exchange
-        made = kind.made_ports(board.params, types)
-    for port, entry in made.inputs.items():
+        added_ports = kind.made_ports(board.params, types)
+    for port, entry in added_ports.inputs.items():
         entry.name = port
         reads[port] = entry.source
-    outputs = {**kind.outputs, **made.outputs}
-    if exchange and made.is_whole:
+    outputs = {**kind.outputs, **added_ports.outputs}
+    if exchange and added_ports.is_whole:
         # If the class has an output of this name, it stays, and a rule reports it.
         outputs.setdefault(EXCHANGE, Output(exchange_message(reads)))
-    inputs = {**kind.inputs, **made.inputs}
-    return TaskPorts(place, kind, inputs, outputs, reads, exchange, mistakes, made.is_whole)
+    inputs = {**kind.inputs, **added_ports.inputs}
+    return TaskPorts(place, kind, inputs, outputs, reads, exchange, mistakes, added_ports.is_whole)
 
 
 def _class(place: TaskPlace) -> LevelClass:
@@ -163,11 +163,13 @@ def _connections(
         boards = neighbours.get(start, (start,))
         key = f"{place.reads_key}.{port}" if port in wired else start
         mailboxes = wired.get(port, tuple(f"{board}.{rest}" for board in boards))
-        what = f"port '{port}' of the {place.role}"
+        port_text = f"port '{port}' of the {place.role}"
         if not mailboxes and not entry.optional:
-            mistakes.append(Mistake(f"{place.table}.{start}", None, f"missing; {what} needs it"))
+            mistakes.append(
+                Mistake(f"{place.table}.{start}", None, f"missing; {port_text} needs it")
+            )
         elif len(mailboxes) > 1 and not entry.many:
-            why = f"{what} reads one mailbox, not {len(mailboxes)}"
+            why = f"{port_text} reads one mailbox, not {len(mailboxes)}"
             mistakes.append(Mistake(f"{place.table}.{key}", wired.get(port, boards), why))
         elif key not in ("above", "below") or others.issuperset(boards):
             yield port, _by_board(mailboxes) if entry.many else mailboxes[0]

@@ -67,10 +67,10 @@ class FaultRules:
         """Yield every mistake in the fault."""
         # The beginning and the end must each be given in only one way.
         for keys in (("tick", "at", "when"), ("for", "cycles")):
-            given = [key for key in keys if self._value(key) is not None]
-            for key in given[1:]:
+            given_keys = [key for key in keys if self._value(key) is not None]
+            for key in given_keys[1:]:
                 yield self._mistake(
-                    key, f"{given[0]} is also given; give only one of {', '.join(keys)}"
+                    key, f"{given_keys[0]} is also given; give only one of {', '.join(keys)}"
                 )
         fault = self.fault
         places = (*self.config.tasks(), *self.config.hosts())
@@ -171,7 +171,7 @@ class FaultRules:
     def _why_not_mailbox(self, kind: Kind) -> str:
         """Return why a fault of this kind cannot strike the task's mailboxes. Empty if it can."""
         board = self.fault.board
-        wanted = self.fault.mailbox
+        mailbox = self.fault.mailbox
         layout = self._layout_of(board)
         if layout is None or board == CLOCK or not kind.takes_mailbox:
             return ""
@@ -181,18 +181,18 @@ class FaultRules:
             for m in layout.mailboxes
             if m.writer == board and (kind.where == "bus" or not is_position(m))
         }
-        struck = [m for m in written.values() if wanted in (None, m.name)]
-        if wanted is not None and not struck:
+        struck = [m for m in written.values() if mailbox in (None, m.name)]
+        if mailbox is not None and not struck:
             return f"'{board}' does not write it; it writes: {_listed(written)}"
         if kind.not_queued and struck and all(m.protocol == "queue" for m in struck):
             why = f"'{struck[0].name}' is a queue, which {kind.name} does not strike"
             return f"{why}: {kind.not_queued}"
         # If boards are missing from the layout, they may be the readers.
-        if kind.where == "bus" and wanted is None and not self.unspecified:
+        if kind.where == "bus" and mailbox is None and not self.unspecified:
             has_reader = any(m.readers for m in struck)
             return "" if has_reader else f"missing; no mailbox of '{board}' has a reader"
         locked = [m.name for m in written.values() if m.protocol == "lock"]
-        if kind.where == "lock" and (not locked or wanted not in (None, *locked)):
+        if kind.where == "lock" and (not locked or mailbox not in (None, *locked)):
             why = f"{kind.name} needs protocol lock; mailboxes of '{board}' that use it"
             return f"{why}: {_listed(locked)}"
         return ""

@@ -53,14 +53,14 @@ def obtained_core(core: int) -> int:
 
 def shared_out(config: RackConfig) -> list[str]:
     """Return a note for every requested core that is not available and is replaced."""
-    wanted: dict[int, list[str]] = {config.clock.core: [CLOCK]}
+    requested: dict[int, list[str]] = {config.clock.core: [CLOCK]}
     for place in config.tasks():
-        wanted.setdefault(place.core, []).append(place.name)
+        requested.setdefault(place.core, []).append(place.name)
     available = ", ".join(map(str, sorted(os.sched_getaffinity(0))))
     return [
         f"core {core} is not available (available: {available}): core {obtained_core(core)} runs"
         f" {', '.join(tasks)}"
-        for core, tasks in sorted(wanted.items())
+        for core, tasks in sorted(requested.items())
         if obtained_core(core) != core
     ]
 

@@ -36,10 +36,10 @@ def mistakes_of(
         tables: The tables.
         place: Place of the tables in the config. Empty for the whole config.
     """
-    found = [_mistake(entry, model, tables, place) for entry in error.errors(include_url=False)]
+    reports = [_mistake(entry, model, tables, place) for entry in error.errors(include_url=False)]
     # pydantic reports a value of a union once for each member type. Keep the first report for each
     # place, and drop a report about a container if there is one about a value inside it.
-    first = {mistake.place: mistake for mistake in reversed(found)}
+    first = {mistake.place: mistake for mistake in reversed(reports)}
     within = {
         place
         for place in first

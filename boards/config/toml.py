@@ -34,8 +34,8 @@ def parse(text: str, place: str = "config") -> Tables:
         raise ConfigError([Mistake(place, None, f"not TOML: {error}")]) from None
     except ValueError as error:
         raise ConfigError([Mistake(place, None, str(error))]) from None
-    found = (_out_of_bounds(f"{place}: {key}", value, 1) for key, value in tables.items())
-    if mistakes := list(chain.from_iterable(found)):
+    checks = (_out_of_bounds(f"{place}: {key}", value, 1) for key, value in tables.items())
+    if mistakes := list(chain.from_iterable(checks)):
         raise ConfigError(mistakes)
     return tables
 

@@ -274,8 +274,8 @@ class AlarmEvents:
             code = finding.name
             subject = board = owner
             measured = f"{value:.6g} {finding.unit}".removesuffix(" 1")
-            said = bytes(row["text"]).decode("utf-8", "replace") or finding.meaning
-            words["what"] = printable(f"{code}: {measured}, {said}")
+            detail = bytes(row["text"]).decode("utf-8", "replace") or finding.meaning
+            words["what"] = printable(f"{code}: {measured}, {detail}")
         else:
             subject = self._subject(about, number, owner)
             board = subject if alarm == Alarm.REJOINED else owner

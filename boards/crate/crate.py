@@ -162,12 +162,12 @@ class Crate:
                 text = "" if snapshot is None or not name else snapshot.copies[name].show()
                 self._line.send(Shown(-1 if snapshot is None else snapshot.tick, text))
 
-    def _open(self, wanted: Open) -> None:
+    def _open(self, opening: Open) -> None:
         """Attach to a segment, and fill it if the rack continues from a snapshot."""
-        self._opened = segment = Segment.attach(wanted.rack)
+        self._opened = segment = Segment.attach(opening.rack)
         note_used_files()
-        set_priority(wanted.priority)
-        snapshot = None if wanted.before is None else self._shelf.nearest(wanted.before)
+        set_priority(opening.priority)
+        snapshot = None if opening.before is None else self._shelf.nearest(opening.before)
         if snapshot is not None:
             fill_memory(segment, snapshot.memory, snapshot.tick)
             self._to_go_on = {**snapshot.copies}
@@ -204,12 +204,12 @@ class Crate:
         words[System.SNAPSHOTS] = len(self._shelf)
         words[System.SNAPSHOT_BYTES] = self._shelf.private_bytes
 
-    def _preload(self, wanted: Preload) -> None:
+    def _preload(self, request: Preload) -> None:
         """Import and preload what the boards share. The Rack reports mistakes of the config."""
-        sys.path[:] = wanted.path
+        sys.path[:] = request.path
         compiled.on_compile = lambda function: self._line.send(Compiling(function))
         load_machine_code()
-        for reference in wanted.classes:
+        for reference in request.classes:
             if reference in self._preloaded:
                 continue
             self._line.send(Preloading(reference))
@@ -225,12 +225,12 @@ class Crate:
                     self._line.send(PreloadFailed(reference, reason))
                     return
                 self._preloaded.add(reference)
-        if wanted.cell is not None:
+        if request.cell is not None:
             # Compile the cell once for all boards. The Rack reports mistakes in it.
             from rack.levels.robot.cell import build_cell
 
             with suppress(RobotError):
-                build_cell(wanted.cell.robot, wanted.cell.scene, wanted.cell.clock_ns)
+                build_cell(request.cell.robot, request.cell.scene, request.cell.clock_ns)
         compiled.on_compile = None
         gc.freeze()
         gc.enable()

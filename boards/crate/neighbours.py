@@ -65,7 +65,7 @@ def holders(ignored: str) -> dict[int, Holder]:
 
 def _seen(rack: str) -> dict[int, Holder]:
     """Find the cores that a rack occupies from the names and priorities of processes."""
-    held: dict[int, Holder] = {}
+    occupied: dict[int, Holder] = {}
     for folder in Path("/proc").glob("[0-9]*"):
         pid = int(folder.name)
         # The process may have ended.
@@ -75,27 +75,27 @@ def _seen(rack: str) -> dict[int, Holder]:
             policy = os.sched_getscheduler(pid) & ~os.SCHED_RESET_ON_FORK
             if name.startswith(f"{rack}:"[:15]) and policy in (os.SCHED_FIFO, SCHED_DEADLINE):
                 for core in os.sched_getaffinity(pid):
-                    others = held[core].tasks if core in held else ()
-                    held[core] = Holder(
+                    others = occupied[core].tasks if core in occupied else ()
+                    occupied[core] = Holder(
                         rack, f"process {pid}", (*others, name.removeprefix(f"{rack}:"))
                     )
-    return held
+    return occupied
 
 
 def _held(segment: Segment) -> dict[int, list[str]]:
     """Return the real-time tasks of a running rack by core, from its segment."""
     if segment.words[System.STATE] == Run.STOPPED:
         return {}
-    held: dict[int, list[str]] = {}
+    occupied: dict[int, list[str]] = {}
     for task in segment.layout.tasks:
         if segment.block(task.name)[Block.PRIORITY]:
-            held.setdefault(task.core, []).append(task.name)
+            occupied.setdefault(task.core, []).append(task.name)
     # The config is not validated: another version of this program may have created the segment.
     clock = load_toml(segment.config).get("clock", {})
     # If the boards were refused their priority, so was the clock.
-    if held and clock.get("priority"):
-        held.setdefault(obtained_core(clock["core"]), []).append(CLOCK)
-    return held
+    if occupied and clock.get("priority"):
+        occupied.setdefault(obtained_core(clock["core"]), []).append(CLOCK)
+    return occupied
 
 
 def placed(config: RackConfig, held: Mapping[int, Holder]) -> tuple[RackConfig, list[str]]:
