@@ -193,16 +193,16 @@ class SensorConfig(Table):
     """
 
     resolution: NotNegative | tuple[NotNegative, ...] = 0.0
-    """step of a joint position as sensed, rad"""
+    """step of a joint position as sensed [rad]"""
     noise: NotNegative | tuple[NotNegative, ...] = 0.0
-    """standard deviation of a joint position as sensed, rad"""
+    """standard deviation of a joint position as sensed [rad]"""
 
 
 class CalibrationConfig(Table):
     """`[robot.calibration]`: how the drives' samples become positions of the joints."""
 
     offset: tuple[Finite, ...] | None = None
-    """added to every position that the drives report, rad; default: nothing"""
+    """added to every position that the drives report [rad]; default: nothing"""
     homing: bool = False
     """whether the drives search for their reference while they are being enabled, and know no
     position before"""
@@ -237,20 +237,20 @@ class GripperConfig(Table):
     joint: str
     """MJCF joint whose position is the opening"""
     open: Finite
-    """joint position when open, m or rad"""
+    """joint position when open [m or rad]"""
     closed: Finite
-    """joint position when closed without an object, m or rad"""
+    """joint position when closed without an object [m or rad]"""
     force: Positive
-    """largest force or torque of the actuator, N or N m"""
+    """largest force or torque of the actuator [N or N m]"""
     stiffness: Positive | None = None
-    """of the position loop, N/m or N m/rad; default: full force at half of the travel"""
+    """of the position loop [N/m or N m/rad]; default: full force at half of the travel"""
     damping: Positive | None = None
-    """of the position loop, N s/m or N m s/rad; default: 30 ms times the stiffness"""
+    """of the position loop [N s/m or N m s/rad]; default: 30 ms times the stiffness"""
     follow: tuple[FollowConfig, ...] = ()
     """joints that follow the driven joint although the model does not couple them"""
     residual: Positive = 0.012
     """largest distance by which fingers may settle from their planned pose because soft couplings
-    yield, or by which a loop may stay open, m; the default is less than the 15 mm clearance of
+    yield, or by which a loop may stay open [m]; the default is less than the 15 mm clearance of
     planned motion"""
 
     @model_validator(mode="after")
@@ -283,15 +283,15 @@ class WristConfig(Table):
     """`[robot.wrist]`: a force/torque sensor between arm and tool, and limits on contact."""
 
     force: str
-    """MJCF force sensor; its cutoff is its range, N"""
+    """MJCF force sensor; its cutoff is its range [N]"""
     torque: str
-    """MJCF torque sensor at the same site; its cutoff is its range, N m"""
+    """MJCF torque sensor at the same site; its cutoff is its range [N m]"""
     most_force: Positive
-    """force of a contact at which the arm stops, N; within the range"""
+    """force of a contact at which the arm stops [N]; within the range"""
     most_torque: Positive
-    """torque of a contact at which the arm stops, N m; within the range"""
+    """torque of a contact at which the arm stops [N m]; within the range"""
     noise: NotNegative = 0.0
-    """standard deviation of a force as sensed, N; of a torque a tenth, N m"""
+    """standard deviation of a force as sensed [N]; of a torque a tenth, N m"""
 
 
 class FingerConfig(Table):
@@ -318,11 +318,11 @@ class HandConfig(Table):
     extensors: tuple[str, ...]
     """MJCF actuators on the tendons that turn a joint in negative direction"""
     least: Positive
-    """tension below which a tendon is slack, N"""
+    """tension below which a tendon is slack [N]"""
     rest: Positive
-    """mean tension of a pair at rest, N; it does not stiffen joints with linear tendons"""
+    """mean tension of a pair at rest [N]; it does not stiffen joints with linear tendons"""
     closed: NotNegative = 0.0
-    """stiffness of a tendon whose valve is closed, due to the enclosed air, N/m; with 0 it keeps
+    """stiffness of a tendon whose valve is closed, due to the enclosed air [N/m]; with 0 it keeps
     its tension"""
 
 
@@ -330,7 +330,7 @@ class ToolConfig(Table):
     """`[robot.tool_offset]`: the tool's frame on a body, for a model without a site for it."""
 
     position: Vector = (0.0, 0.0, 0.0)
-    """of the tool in the body's frame, m"""
+    """of the tool in the body's frame [m]"""
     quaternion: tuple[Finite, Finite, Finite, Finite] = (1.0, 0.0, 0.0, 0.0)
     """of the tool in the body's frame, as w, x, y, z; its z axis is the direction of approach"""
 
@@ -352,20 +352,20 @@ class RobotConfig(Table):
     tool_offset: ToolConfig | None = None
     """pose of the tool on the body that `tool` names; default: the body's own"""
     home: tuple[Finite, ...] = Field((), min_length=1)
-    """joint positions to which tasks return, and the simulated start, rad; default: the
+    """joint positions to which tasks return, and the simulated start [rad]; default: the
     first keyframe"""
     start: tuple[Finite, ...] | None = None
-    """start position of the simulated arm, rad; default: home"""
+    """start position of the simulated arm [rad]; default: home"""
     velocity: tuple[Positive, ...]
-    """velocity limits, rad/s"""
+    """velocity limits [rad/s]"""
     acceleration: tuple[Positive, ...]
-    """acceleration limits of planned motion, rad/s2"""
+    """acceleration limits of planned motion [rad/s2]"""
     jerk: tuple[Positive, ...]
-    """jerk limits of planned motion, rad/s3"""
+    """jerk limits of planned motion [rad/s3]"""
     torque: tuple[Positive, ...] | None = None
-    """torque limits, N m; default: the model's actuator limits"""
+    """torque limits [N m]; default: the model's actuator limits"""
     position: tuple[tuple[Finite, Finite], ...] | None = None
-    """position limits, rad; default: the model's joint ranges"""
+    """position limits [rad]; default: the model's joint ranges"""
     interface: Interface = "torque"
     """command that the drives accept in every cycle: torques, or set points of position or velocity
     for drives that close their control loops themselves, which the simulated arm does, too"""
@@ -379,20 +379,20 @@ class RobotConfig(Table):
     calibration: CalibrationConfig = CalibrationConfig()
     """conversion of the drives' samples to joint positions"""
     latency_ticks: int = Field(0, ge=0, le=20)
-    """age of the newest sample when a cycle reads it, due to the bus to the drives, ticks; the
+    """age of the newest sample when a cycle reads it, due to the bus to the drives [ticks]; the
     simulated arm delays its samples accordingly"""
     wrist: WristConfig | None = None
     """force/torque sensor, if the arm has one"""
     hand: HandConfig | None = None
     """tendons and fingers, for a hand in place of an arm"""
     patience_ms: Positive | None = Field(None, le=100.0)
-    """time for which motors keep the last torque when no new one arrives, ms; then the brakes
+    """time for which motors keep the last torque when no new one arrives [ms]; then the brakes
     engage; rounded down to whole torque cycles, at least one; the default depends on the arm's
     motion in that time, see `rack check --verbose`"""
     substeps: int = Field(5, ge=1, le=50)
     """MuJoCo steps in one servo cycle"""
     min_armature: Finite = Field(0.05, ge=0)
-    """minimum drive inertia of every joint, kg m2; light wrists need it"""
+    """minimum drive inertia of every joint [kg m2]; light wrists need it"""
     enable: Literal["at-start", "by-command"] | None = None
     """when drives are enabled: at the start, or by `rack command RACK servo enable`;
     default: at-start for the simulated arm, by-command for every other"""
@@ -439,11 +439,11 @@ class MotionConfig(Table):
     body: str
     """obstacle that moves"""
     at: Moment
-    """simulated time when it starts, s"""
+    """simulated time when it starts [s]"""
     to: Vector
-    """final position of its origin, m"""
+    """final position of its origin [m]"""
     speed: Positive = 0.25
-    """speed along the straight line, m/s"""
+    """speed along the straight line [m/s]"""
 
 
 class PushConfig(Table):
@@ -452,13 +452,13 @@ class PushConfig(Table):
     body: str
     """object that is pushed"""
     at: Moment
-    """simulated time when it begins, s"""
+    """simulated time when it begins [s]"""
     seconds: Positive
-    """time for which it lasts, s"""
+    """time for which it lasts [s]"""
     force: Vector
-    """force at the centre of mass, in the world's frame, N"""
+    """force at the centre of mass, in the world's frame [N]"""
     rise: NotNegative = 0.0
-    """time in which the force rises at the start and falls at the end, s"""
+    """time in which the force rises at the start and falls at the end [s]"""
 
 
 class GoalConfig(Table):
@@ -470,11 +470,11 @@ class GoalConfig(Table):
     object: str
     """object that the task moves, or leaves in place"""
     position: Vector
-    """final position of its origin, m"""
+    """final position of its origin [m]"""
     # A gripper centres a part across its pads, but not along them. In that direction the part keeps
     # its offset, or slips.
     tolerance_mm: Positive = 10.0
-    """distance from the goal within which the task counts as done, mm"""
+    """distance from the goal within which the task counts as done [mm]"""
 
 
 class SceneConfig(Table):
@@ -487,7 +487,7 @@ class SceneConfig(Table):
     supports: tuple[str, ...] = ()
     """geoms on which objects may stand, and on which a tool on a wrist sensor may press"""
     clearance: Positive = 0.015
-    """distance that planned motion keeps from everything, m"""
+    """distance that planned motion keeps from everything [m]"""
     motion: tuple[MotionConfig, ...] = ()
     """moves of obstacles, by time"""
     push: tuple[PushConfig, ...] = ()

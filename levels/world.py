@@ -16,13 +16,13 @@ class WorldParams(Table):
     """Thresholds by which a body counts as moving or resting."""
 
     moved: Positive = 0.002
-    """distance from its resting place beyond which a body counts as moving, m"""
+    """distance from its resting place beyond which a body counts as moving [m]"""
     turned: Positive = 0.02
-    """angle from its resting orientation beyond which a body counts as moving, rad"""
+    """angle from its resting orientation beyond which a body counts as moving [rad]"""
     slow: Positive = 0.005
-    """speed below which a moving body may come to rest, m/s"""
+    """speed below which a moving body may come to rest [m/s]"""
     resting: Positive = 0.2
-    """time at low speed after which a body counts as resting, s"""
+    """time at low speed after which a body counts as resting [s]"""
 
 
 class WorldModel(Executor):

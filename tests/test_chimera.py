@@ -37,15 +37,19 @@ def test_a_board_reserves_twice_its_budget_in_each_of_its_cycles_by_deadlines_al
 
 
 MISTAKES = {
-    "tight": ("nasrem", (), 'board.task.coupling = "tight": its planner\'s update takes'),
+    "tight": ("nasrem", (), 'board.task.coupling = "tight": a planner with'),
     "polling": ("chimera", ("board.servo.wake=poll",), 'board.servo.wake = "poll": busy-waiting'),
     "no time": ("chimera", ("timing.clock_ms=0",), "timing.clock_ms = 0.0: missing; the clock"),
     "no budget": (
         "chimera",
         tuple(f"board.arm.budget.{part}_ms=0" for part in ("read", "process", "write")),
-        "board.arm.budget: missing; the board reserves twice as much",
+        "board.arm.budget: missing; the board reserves twice its budget",
     ),
-    "network": ("brown/servo", (), "not with a network, whose threads need the adapter's priority"),
+    "network": (
+        "brown/servo",
+        (),
+        "the network adapter's threads need its priority; use fixed-priority",
+    ),
 }
 
 

@@ -1,16 +1,17 @@
-"""Configs: from TOML to a rack.
+"""Configs of racks: reading, checking and wiring.
 
-- `load(name, overrides, faults)`, `loads(text)`: read and validate the tables, return a
-  `RackConfig`, whose levels can be imported from now on.
-- `read_stored(text)`: read the config of a rack or a run, and import nothing.
-- `resolve(config)`: check and wire everything, return `Resolved`: config, layout, wiring, faults,
-  commands.
-- `wire(config)`: the layout alone.
-- `shared_out(config)`: a line for every requested core that does not exist.
-- `names()`, `CONFIGS`, `FAULTS`: the bundled configs and fault scripts.
-- `budgets(config)`, `rack_timing(config, layout)`: the config in terms of the timing model.
+- `load(name, overrides, faults)` and `load_text(text)` read and validate the tables and return a
+  `RackConfig`. Its levels can be imported afterwards.
+- `read_stored(text)` reads the config of a rack or a run and imports nothing.
+- `resolve(config)` checks and wires everything and returns `Resolved`: config, layout, wiring,
+  faults and commands.
+- `resolve_layout(config)` returns the layout alone.
+- `list_replaced_cores(config)` returns a line for every requested core that does not exist.
+- `list_names()`, `CONFIGS` and `FAULTS` are the bundled configs and fault scripts.
+- `read_budgets(config)` and `build_rack_timing(config, layout)` describe the config in the terms of
+  the timing model.
 
-Everything wrong with a config is a `ConfigError`, which reports all mistakes at once.
+A config with mistakes raises a `ConfigError`, which reports all of them at once.
 """
 
 from __future__ import annotations
@@ -51,5 +52,6 @@ _PLACES = {
     "rack.boards.config.timing": ("budgets", "rack_timing"),
 }
 
-if not TYPE_CHECKING:  # a type checker would take every misspelt name for one of these
+# Hidden from type checkers, which would otherwise accept every misspelt name.
+if not TYPE_CHECKING:
     __getattr__ = on_first_use(__name__, _PLACES)

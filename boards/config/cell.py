@@ -1,6 +1,7 @@
 """Data derived from the arm and its cell.
 
-Importing MuJoCo takes 0.5 s, so the import is inside functions: only racks with an arm pay for it.
+MuJoCo is imported inside the functions, because that takes 0.5 s, which a rack without an arm need
+not spend.
 """
 
 from __future__ import annotations
@@ -15,7 +16,10 @@ if TYPE_CHECKING:
 
 
 def cell_sizes(config: RackConfig) -> dict[str, int]:
-    """Return the symbolic sizes by name, none without an arm. Raises `RobotError`."""
+    """Return the sizes that messages use by name, such as the number of joints.
+
+    Empty for a rack without an arm. Raises `RobotError` if arm and scene do not fit the model.
+    """
     if config.robot is None:
         return {}
     from rack.levels.robot.cell import sizes
@@ -24,7 +28,7 @@ def cell_sizes(config: RackConfig) -> dict[str, int]:
 
 
 def geom_name(config: RackConfig, geom: int) -> str:
-    """Return the name of a geom of the cell, by its number in shared memory."""
+    """Return the name of a geom of the cell from its number, which comes from shared memory."""
     from rack.levels.robot import lookup
 
     model = built_cell(config).model
@@ -32,7 +36,7 @@ def geom_name(config: RackConfig, geom: int) -> str:
 
 
 def built_cell(config: RackConfig) -> Cell:
-    """Return the cell of a rack with an arm. Raises `RobotError`."""
+    """Build the cell of a rack that has an arm. Raises `RobotError` if arm and scene do not fit."""
     from rack.levels.robot.cell import build_cell
 
     assert config.robot is not None, "the rack has an arm"

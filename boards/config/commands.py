@@ -1,6 +1,4 @@
-"""Operator commands: what a level takes, with which goal, and their requests in the operator
-table.
-"""
+"""Operator commands of a config: checks, and requests for the operator table."""
 
 from __future__ import annotations
 
@@ -38,9 +36,7 @@ DOWN = (0.0, 0.0, -1.0)
 
 
 def takes(level: PublishedLevel) -> str:
-    """Return the commands that a level takes as text, with the names that it knows: "hold, resume,
-    table saw|slow".
-    """
+    """Return the commands of a level as text, with valid names: "hold, resume, table saw|slow"."""
     words = []
     for what, goals in level.commands.items():
         names = "|".join(level.wording.get(what, ()))
@@ -49,25 +45,37 @@ def takes(level: PublishedLevel) -> str:
     return ", ".join(words)
 
 
-def asked(given: Mapping[str, Any]) -> CommandConfig:
-    """Return the command in a mapping, as in a `[[command]]` table. Raises `ConfigError` with every
-    mistake.
+def asked(table: Mapping[str, Any]) -> CommandConfig:
+    """Return the command that a `[[command]]` table describes.
+
+    Raises:
+        ConfigError: The table has mistakes. All of them are listed.
     """
     try:
-        return CommandConfig.model_validate(given)
+        return CommandConfig.model_validate(table)
     except ValidationError as error:
-        raise ConfigError(mistakes_of(error, CommandConfig, given)) from None
+        raise ConfigError(mistakes_of(error, CommandConfig, table)) from None
 
 
 def request(command: CommandConfig, config: RackConfig, levels: Levels, layout: Layout) -> Request:
-    """Return the request of one command. Raises `ConfigError` with every mistake."""
+    """Check a live command and return its request for the operator table.
+
+    Args:
+        command: The command.
+        config: Config of the running rack.
+        levels: Levels that the rack has published.
+        layout: Layout of its segment.
+
+    Raises:
+        ConfigError: The command has mistakes. All of them are listed.
+    """
     if mistakes := command_mistakes([("", command)], config, levels):
         raise ConfigError(mistakes)
     return _request(command, layout)
 
 
 def requests(config: RackConfig, layout: Layout) -> tuple[Request, ...]:
-    """Return the requests of a config whose commands have been checked."""
+    """Return the requests for the commands of a checked config."""
     return tuple(_request(command, layout) for command in config.command)
 
 
@@ -95,31 +103,30 @@ def command_mistakes(
     levels: Levels,
     broken: Collection[str] = (),
 ) -> list[Mistake]:
-    """Check commands.
+    """Return every mistake in operator commands.
 
     Args:
         commands: The commands, with their places in a config. A live command has an empty place.
         config: The config of the rack.
         levels: Its levels.
         broken: Boards with known mistakes. Commands for them are not checked.
-
-    Returns:
-        Every mistake.
     """
-    given = list(commands)
-    found = [
+    placed = list(commands)
+    mistakes = [
         mistake
-        for place, command in given
+        for place, command in placed
         if command.level not in broken
         for mistake in _mistakes(place, command, config, levels)
     ]
-    if len(given) > OPERATOR_ENTRIES:
-        found.append(
+    if len(placed) > OPERATOR_ENTRIES:
+        mistakes.append(
             Mistake(
-                "command", len(given), f"too many pending commands; permitted: {OPERATOR_ENTRIES}"
+                "command",
+                len(placed),
+                f"too many commands; at most {OPERATOR_ENTRIES} may be pending",
             )
         )
-    return found
+    return mistakes
 
 
 def _mistakes(
@@ -127,7 +134,7 @@ def _mistakes(
 ) -> Mistakes:
     at = partial(at_key, place)
     if command.tick is not None and command.at is not None:
-        yield Mistake(at("at"), command.at, "tick is also given; permitted: one of tick, at")
+        yield Mistake(at("at"), command.at, "tick is also given; give only one of tick, at")
     levels = {name: level for name, level in published.items() if level.commands}
     if command.level not in levels:
         why = f"no level of this name takes commands; levels that do: {', '.join(levels) or 'none'}"
@@ -154,40 +161,41 @@ def _mistakes(
 
 
 def _goal(at: Callable[[str], str], command: CommandConfig, known: Commands) -> Mistakes:
-    """Check that there is one goal, of a form that the level accepts."""
-    wanted = known[command.said]
-    given = command.goals
+    """Check that a command has exactly one goal, of a form that the level accepts."""
+    accepted = known[command.said]
+    goals = command.goals
     what = f"{command.what} of '{command.level}'"
-    if not wanted:
-        for goal in given:
+    if not accepted:
+        for goal in goals:
             yield Mistake(at(_key(goal)), None, f"{command.what} takes no goal; remove it")
-    elif len(given) != 1:
-        why = "missing" if not given else f"several given: {goal_names(given)}"
-        yield Mistake(at("goal"), None, f"{why}; {what} takes one of: {goal_names(wanted)}")
-    elif given[0] not in wanted:
+    elif len(goals) != 1:
+        why = "missing" if not goals else f"several given: {goal_names(goals)}"
+        yield Mistake(at("goal"), None, f"{why}; {what} takes one of: {goal_names(accepted)}")
+    elif goals[0] not in accepted:
         yield Mistake(
-            at(_key(given[0])), None, f"not a goal for {what}; permitted: {goal_names(wanted)}"
+            at(_key(goals[0])), None, f"not a goal for {what}; valid goals: {goal_names(accepted)}"
         )
-    elif command.position is None and given[0] in (Goal.POSE, Goal.DIRECTION):
+    elif command.position is None and goals[0] in (Goal.POSE, Goal.DIRECTION):
         yield Mistake(at("position"), None, "missing; tool position, m")
     elif command.quaternion is not None and command.direction is not None:
-        why = "quaternion is also given; permitted: one of quaternion, direction"
+        why = "quaternion is also given; give only one of quaternion, direction"
         yield Mistake(at("direction"), list(command.direction), why)
 
 
 def _key(goal: Goal) -> str:
+    """Return the key of a `[[command]]` table that gives a goal of this form."""
     keys = {Goal.POSE: "quaternion", Goal.DIRECTION: "position", Goal.OFF: "on"}
     return keys.get(goal, goal.name.lower())
 
 
 def _name(place: str, command: CommandConfig, level: PublishedLevel) -> Mistakes:
-    """Check that an operation that gives a name, and no other, gives one that its level knows."""
+    """Check that the name in a command is known to its level, or absent if it takes none."""
     if command.said not in NAMED:
         if command.name is not None:
             yield Mistake(place, command.name, f"{command.what} takes no name; remove it")
         return
     known = level.wording.get(command.said)
-    # Mistakes that keep the names unknown are reported elsewhere.
+    # The names are unknown if the level's table has mistakes, which are reported separately.
     if known is not None and command.name not in known:
         yield Mistake(
             place,
@@ -206,15 +214,15 @@ def _setting(place: str, command: CommandConfig, level: PublishedLevel) -> Mista
         return
     params = name if place else f"board.{command.level}.params"
     if not level.live or (key in level.keys and key not in level.live):
-        why = f"read at the launch alone; live: {', '.join(level.live) or 'none'}"
+        why = f"it is read at the launch only; live parameters: {', '.join(level.live) or 'none'}"
         yield Mistake(f"{params}.{key}", value, why)
         return
     table = level.table
-    given = {key: value}
+    setting = {key: value}
     try:
-        table.model_validate(given)
+        table.model_validate(setting)
     except ValidationError as error:
-        yield from mistakes_of(error, table, given, params)
+        yield from mistakes_of(error, table, setting, params)
 
 
 def _joints(place: str, joints: tuple[float, ...], config: RackConfig) -> Mistakes:
@@ -224,7 +232,7 @@ def _joints(place: str, joints: tuple[float, ...], config: RackConfig) -> Mistak
         return
     if len(joints) != len(robot.joints):
         why = (
-            f"{len(joints)} values; permitted: {len(robot.joints)}, one per joint:"
+            f"{len(joints)} values; must be {len(robot.joints)}, one per joint:"
             f" {', '.join(robot.joints)}"
         )
         yield Mistake(place, list(joints), why)
@@ -232,9 +240,10 @@ def _joints(place: str, joints: tuple[float, ...], config: RackConfig) -> Mistak
     try:
         ranges = built_cell(config).limits.position
     except RobotError:
-        return  # reported elsewhere
+        # An arm that does not fit its model is reported by the rules for the robot.
+        return
     for name, value, (low, high) in zip(robot.joints, joints, ranges, strict=True):
         if not low <= value <= high:
             yield Mistake(
-                place, value, f"out of range for joint '{name}'; permitted: {low:g} to {high:g} rad"
+                place, value, f"out of range; joint '{name}' must be {low:g} to {high:g} rad"
             )

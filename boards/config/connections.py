@@ -1,9 +1,8 @@
-"""The wiring of a rack as plain data, made once from its config: the ports of all tasks, and the
-mailboxes they share.
+"""Wiring of a rack, computed from its config: which task reads and writes which mailboxes.
 
-A port's source is a mailbox, or is relative to its board: "above.command", "below.status",
-"own.plan". The config may connect a port to another mailbox. Whether all is right, the rules say
-(`rack.boards.config.rules`).
+The source of a port is a mailbox, or it is relative to the board: "above.command", "below.status",
+"own.plan". The config may connect a port to another mailbox. `rack.boards.config.rules` checks the
+result.
 """
 
 from __future__ import annotations
@@ -43,17 +42,17 @@ LevelClass = type[Executor] | type[Planner] | type[HostProgram]
 
 @dataclass(frozen=True)
 class TaskPorts:
-    """The class of a task or host board, and the mailbox of each port.
+    """Class of a task or host board, and the mailboxes of its ports.
 
     Attributes:
-        place: Its place in the config.
+        place: Place of the task in the config.
         kind: Its class.
-        inputs: The declarations of what it reads, by port.
-        outputs: The declarations of what it writes, by port.
-        reads: A mailbox by port or, for a port that reads many, a dict of mailboxes by board.
-        exchange: When an executor reads its ports.
-        mistakes: Why inputs that the class declares are not connected.
-        is_whole: False if mistakes keep some ports unknown.
+        inputs: Declarations of its inputs, by port.
+        outputs: Declarations of its outputs, by port.
+        reads: Mailbox of each input. For a port that reads several, a dict of mailboxes by board.
+        exchange: When an executor reads its ports, by port.
+        mistakes: Reasons why declared inputs are not connected.
+        is_whole: False if mistakes hide some of the ports that the config adds.
     """
 
     place: TaskPlace
@@ -72,12 +71,12 @@ class TaskPorts:
 
     @property
     def joins_sides(self) -> bool:
-        """Whether it is the bus adapter between boards and host boards."""
+        """Whether the task is the bus adapter between boards and host boards."""
         return issubclass(self.kind, Adapter) and self.kind.joins_sides
 
     @cached_property
     def sources(self) -> list[tuple[str, str]]:
-        """Port and mailbox of everything that the task reads."""
+        """Pairs of port and mailbox for every mailbox that the task reads."""
         return [
             (port, mailbox)
             for port, source in self.reads.items()
@@ -86,11 +85,11 @@ class TaskPorts:
 
     @cached_property
     def writes(self) -> dict[str, str]:
-        """The mailboxes that the task writes, by port."""
+        """Mailboxes that the task writes, by port."""
         return {port: f"{self.place.board}.{port}" for port in self.outputs}
 
     def rests_on(self, output: str) -> tuple[str, ...]:
-        """Return the mailboxes on whose information an output rests."""
+        """Return the mailboxes from which the information in an output comes."""
         source = self.outputs[output].rests_on
         return () if source is None else mailboxes_of(self.reads.get(source.name, {}))
 
@@ -98,36 +97,36 @@ class TaskPorts:
 def _connected(
     config: RackConfig, place: TaskPlace, kind: LevelClass, types: Mapping[str, type[Message]]
 ) -> TaskPorts:
-    """Return the ports of a task or host board.
+    """Connect the ports of a task or host board.
 
     Args:
         config: The config of the rack.
-        place: The place of the task in it.
-        kind: Its class.
-        types: The message classes of mailboxes, as far as they are known. Ports that the config
-            makes have the types of other mailboxes.
+        place: Place of the task in the config.
+        kind: Class of the task.
+        types: Message classes of the mailboxes known so far. Ports that the config adds take their
+            types from other mailboxes.
     """
     mistakes: list[Mistake] = []
     reads = dict(_connections(config, place, kind.inputs, mistakes))
     exchange: Mapping[str, ExchangeConfig] = {}
-    made = MadePorts()
+    added_ports = MadePorts()
     if issubclass(kind, Executor):
         board = config.board[place.board]
         exchange = board.exchange
-        made = kind.made_ports(board.params, types)
-    for port, entry in made.inputs.items():
+        added_ports = kind.made_ports(board.params, types)
+    for port, entry in added_ports.inputs.items():
         entry.name = port
         reads[port] = entry.source
-    outputs = {**kind.outputs, **made.outputs}
-    if exchange and made.is_whole:
-        # An output of that name of its own stays.
+    outputs = {**kind.outputs, **added_ports.outputs}
+    if exchange and added_ports.is_whole:
+        # If the class has an output of this name, it stays, and a rule reports it.
         outputs.setdefault(EXCHANGE, Output(exchange_message(reads)))
-    inputs = {**kind.inputs, **made.inputs}
-    return TaskPorts(place, kind, inputs, outputs, reads, exchange, mistakes, made.is_whole)
+    inputs = {**kind.inputs, **added_ports.inputs}
+    return TaskPorts(place, kind, inputs, outputs, reads, exchange, mistakes, added_ports.is_whole)
 
 
 def _class(place: TaskPlace) -> LevelClass:
-    """Return the class of a task or host board. Raises `LookupError` if there is none."""
+    """Return the class of a task or host board. Raises `LookupError` if it is not usable."""
     if place.role == "executor":
         return find_class(place.target, Executor)
     if place.role == "planner":
@@ -137,7 +136,7 @@ def _class(place: TaskPlace) -> LevelClass:
         return planner
     program = find_class(place.target, HostProgram)
     if many := [port for port, entry in program.inputs.items() if entry.many]:
-        raise LookupError(f"port '{many[0]}' reads many mailboxes; permitted on the host side: one")
+        raise LookupError(f"port '{many[0]}' of a host board must not read several mailboxes")
     return program
 
 
@@ -147,7 +146,14 @@ def _connections(
     inputs: Mapping[str, InputPort[Any]],
     mistakes: list[Mistake],
 ) -> Iterator[tuple[str, Source]]:
-    """Yield what each input reads; of inputs that cannot be connected, add the mistakes."""
+    """Yield each input with the mailboxes that it reads.
+
+    Args:
+        config: The config of the rack.
+        place: Place of the task in the config.
+        inputs: Declared inputs of the task, by port.
+        mistakes: List to which the mistakes of inputs that cannot be connected are added.
+    """
     table = config.table(place)
     wired = config.rewired(place)
     neighbours = {"own": (place.board,), "above": getattr(table, "above", ()), "below": table.below}
@@ -157,32 +163,33 @@ def _connections(
         boards = neighbours.get(start, (start,))
         key = f"{place.reads_key}.{port}" if port in wired else start
         mailboxes = wired.get(port, tuple(f"{board}.{rest}" for board in boards))
-        what = f"port '{port}' of the {place.role}"
+        port_text = f"port '{port}' of the {place.role}"
         if not mailboxes and not entry.optional:
-            mistakes.append(Mistake(f"{place.table}.{start}", None, f"missing; {what} needs it"))
+            mistakes.append(
+                Mistake(f"{place.table}.{start}", None, f"missing; {port_text} needs it")
+            )
         elif len(mailboxes) > 1 and not entry.many:
-            why = f"{what} reads one mailbox, not {len(mailboxes)}"
+            why = f"{port_text} reads one mailbox, not {len(mailboxes)}"
             mistakes.append(Mistake(f"{place.table}.{key}", wired.get(port, boards), why))
         elif key not in ("above", "below") or others.issuperset(boards):
             yield port, _by_board(mailboxes) if entry.many else mailboxes[0]
 
 
 def _by_board(mailboxes: Sources) -> Source:
-    """Return mailboxes by board, or by their names if one board writes several."""
+    """Return mailboxes by board. If a board writes several of them, these are by mailbox name."""
     boards = [box.partition(".")[0] for box in mailboxes]
-    found = zip(boards, mailboxes, strict=True)
-    return {board if boards.count(board) == 1 else box: box for board, box in found}
+    pairs = zip(boards, mailboxes, strict=True)
+    return {board if boards.count(board) == 1 else box: box for board, box in pairs}
 
 
 class Wiring:
-    """The ports of all tasks and host boards, connected.
+    """Connected ports of all tasks and host boards.
 
     Attributes:
         config: The config of the rack.
-        broken: Tables that the config lacks since they have mistakes of their own, as in
-            "board.servo".
-        ports: The ports of all tasks and host boards that have a class, in order.
-        missing: Why there is no class, of the others.
+        broken: Tables that were removed from the config because of mistakes, as in "board.servo".
+        ports: Ports of every task and host board whose class exists, in order.
+        missing: For all others, the reason why the class cannot be used.
     """
 
     def __init__(self, config: RackConfig, broken: frozenset[str] = frozenset()) -> None:
@@ -205,7 +212,8 @@ class Wiring:
                 for ports in self.ports.values()
                 for port, box in ports.writes.items()
             }
-            # What one board makes another may pass on.
+            # A port that the config adds may pass on another such port, whose type must be known
+            # first: repeat until no mailbox is added.
             if len(written) == len(types):
                 return
             types = written
@@ -217,57 +225,57 @@ class Wiring:
 
     @property
     def tasks(self) -> list[TaskPorts]:
-        """The ports of the tasks."""
+        """Ports of the tasks, without host boards."""
         return [ports for ports in self.ports.values() if ports.place.role != "host"]
 
     @property
     def hosts(self) -> list[TaskPorts]:
-        """The ports of the host boards."""
+        """Ports of the host boards."""
         return [ports for ports in self.ports.values() if ports.place.role == "host"]
 
     @cached_property
     def writers(self) -> dict[str, tuple[TaskPorts, Output[Any]]]:
-        """The first task that writes each mailbox, and its declaration."""
-        found: dict[str, tuple[TaskPorts, Output[Any]]] = {}
+        """For each mailbox, the first task that writes it and the declaration of its output."""
+        writers: dict[str, tuple[TaskPorts, Output[Any]]] = {}
         for ports in self.ports.values():
             for port, mailbox in ports.writes.items():
-                found.setdefault(mailbox, (ports, ports.outputs[port]))
-        return found
+                writers.setdefault(mailbox, (ports, ports.outputs[port]))
+        return writers
 
     @cached_property
     def reading(self) -> dict[str, list[tuple[TaskPorts, str]]]:
-        """Tasks and their ports that read each mailbox."""
-        found: dict[str, list[tuple[TaskPorts, str]]] = {}
+        """For each mailbox, the tasks that read it, each with its port."""
+        reading: dict[str, list[tuple[TaskPorts, str]]] = {}
         for ports in self.ports.values():
             for port, mailbox in ports.sources:
-                found.setdefault(mailbox, []).append((ports, port))
-        return found
+                reading.setdefault(mailbox, []).append((ports, port))
+        return reading
 
     @cached_property
     def operated(self) -> list[str]:
-        """The operators' mailboxes."""
-        found = executors(self.config).items()
-        return [f"{board}.operator" for board, kind in found if takes_commands(kind)]
+        """Mailboxes through which an operator commands levels."""
+        classes = executors(self.config).items()
+        return [f"{board}.operator" for board, kind in classes if takes_commands(kind)]
 
     @cached_property
     def types(self) -> dict[str, MessageType]:
-        """The message type of every mailbox."""
+        """Message type of every mailbox."""
         written = {name: output.message.message_type for name, (_, output) in self.writers.items()}
         return written | dict.fromkeys(self.operated, OperatorCommand.message_type)
 
     @property
     def names(self) -> str:
-        """The names of all mailboxes, as a list to read."""
+        """Names of all mailboxes, separated by commas, for messages."""
         return ", ".join(self.types)
 
     @cached_property
     def from_host(self) -> set[str]:
-        """The mailboxes that host boards write."""
+        """Mailboxes that host boards write."""
         return {mailbox for ports in self.hosts for mailbox in ports.writes.values()}
 
     @cached_property
     def passed(self) -> dict[str, str]:
-        """The mailboxes that bus adapters write, with those that they pass on."""
+        """Mailboxes that bus adapters write, each with the mailbox that it is copied from."""
         return {
             f"{ports.place.board}.{port}": source
             for ports in self.tasks
@@ -277,65 +285,64 @@ class Wiring:
 
     @cached_property
     def to_host(self) -> set[str]:
-        """The mailboxes that bus adapters write for host boards."""
+        """Mailboxes that bus adapters write for host boards."""
         return {mailbox for mailbox, box in self.passed.items() if box not in self.from_host}
 
     @property
     def of_host(self) -> set[str]:
-        """The host side. Only a bus adapter reads on one side and writes on the other."""
+        """Mailboxes of the host side. Only a bus adapter connects them with the other side."""
         return self.from_host | self.to_host
 
     @cached_property
     def every(self) -> dict[str, int]:
-        """The periods of the boards whose rate is on the clock's grid, ticks."""
-        found: dict[str, int] = {}
+        """Periods of the boards, ticks. Boards with an invalid rate are left out."""
+        periods: dict[str, int] = {}
         for name in self.config.board if "clock" not in self.broken else ():
             with suppress(ClockError):
-                found[name] = self.config.every(name)
-        return found
+                periods[name] = self.config.every(name)
+        return periods
 
     @cached_property
     def unknown(self) -> set[str]:
-        """Boards with mistakes of their own: a reader that lacks a mailbox of theirs is not at
-        fault.
-        """
-        found = {place.board for place in self.missing}
-        found |= {ports.place.board for ports in self.ports.values() if not ports.is_whole}
-        found |= {place.removeprefix("board.").removeprefix("host.") for place in self.broken}
+        """Boards whose mistakes hide their mailboxes. A reader of such a mailbox is not wrong."""
+        boards = {place.board for place in self.missing}
+        boards |= {ports.place.board for ports in self.ports.values() if not ports.is_whole}
+        boards |= {place.removeprefix("board.").removeprefix("host.") for place in self.broken}
         is_lan_unknown = "adapter" in self.broken or is_taken(self.config)
-        return found | {LAN} if is_lan_unknown else found
+        return boards | {LAN} if is_lan_unknown else boards
 
     @property
     def params(self) -> Iterable[tuple[str, type[BaseModel]]]:
-        """The tables with parameters, as in "board.servo", and their records, each once."""
-        found = self.ports.items()
+        """Pairs of a table such as "board.servo" and a model of its parameters, without repeats."""
         return dict.fromkeys(
-            (place.table, p.kind.params) for place, p in found if p.kind.params is not None
+            (place.table, ports.kind.params)
+            for place, ports in self.ports.items()
+            if ports.kind.params is not None
         )
 
     @property
     def programs(self) -> Iterable[type[Program]]:
-        """The records of the programs of levels that read `[task]`, each once."""
+        """Models of the programs that levels read from `[task]`, without repeats."""
         return dict.fromkeys(
             p.kind.program for p in self.ports.values() if p.kind.program is not None
         )
 
     def is_known(self, mailbox: str) -> bool:
-        """Return whether a mailbox exists, or may: its board has mistakes of its own."""
+        """Return True if a mailbox exists, or may exist because its board has mistakes."""
         return mailbox in self.types or mailbox.partition(".")[0] in self.unknown
 
     def readers(self, mailbox: str) -> tuple[str, ...]:
-        """Return the tasks and host boards that read a mailbox."""
+        """Return the names of the tasks and host boards that read a mailbox."""
         return tuple(dict.fromkeys(ports.task for ports, _ in self.reading.get(mailbox, ())))
 
     def is_of_network(self, name: str) -> bool:
-        """Return whether a board is the network adapter, or a mailbox one that it writes."""
+        """Return True for the network adapter's board and for the mailboxes that it writes."""
         return self.config.adapter.lan is not None and name.partition(".")[0] == LAN
 
     def protocol(self, mailbox: str) -> Protocol:
-        """Return the protocol of a mailbox."""
+        """Return the protocol of a mailbox, which depends on the config and on its writer."""
         if mailbox in self.to_host:
-            # Host boards read the newest message at once, whatever the protocol.
+            # Host boards always read the newest message at once.
             return "time-slice"
         if mailbox in self.from_host or (
             mailbox in self.writers and self.writers[mailbox][1].queued
@@ -343,29 +350,29 @@ class Wiring:
             return "queue"
         protocol = self.config.protocol.mailbox.get(mailbox, self.config.protocol.default)
         if protocol == "interrupt" and (mailbox in self.operated or self.is_of_network(mailbox)):
-            # No board of the rack sends its messages.
+            # No board of this rack sends these messages, so none can be interrupted by it.
             return "time-slice"
-        # A lock would make the clock wait for readers.
+        # With a lock the clock would wait for readers.
         return "double-buffer" if protocol == "lock" and mailbox in self.operated else protocol
 
 
 def executors(config: RackConfig) -> dict[str, type[Executor]]:
-    """Return the class of each board's executor; those that are missing are reported elsewhere."""
-    found: dict[str, type[Executor]] = {}
+    """Return the executor class of each board. Classes that are missing are left out."""
+    classes: dict[str, type[Executor]] = {}
     for name, board in config.board.items():
         with suppress(LookupError):
-            found[name] = find_class(board.executor, Executor)
-    return found
+            classes[name] = find_class(board.executor, Executor)
+    return classes
 
 
 def takes_commands(executor: type[Executor]) -> bool:
-    """Return True if a level reads the commands of an operator."""
+    """Return True if a level reads commands of an operator."""
     return any(port.source == OWN_OPERATOR for port in executor.inputs.values())
 
 
 def is_taken(config: RackConfig) -> bool:
-    """Say whether another board has the name of the network adapter's."""
-    # If the others are broken, its own is not there either.
+    """Return True if another board has the name of the network adapter's board."""
+    # If tables of boards are broken, the adapter's board may be missing too.
     return (
         config.adapter.lan is not None
         and LAN in config.board

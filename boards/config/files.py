@@ -1,6 +1,4 @@
-"""Config files: found by name or path, merged with the files that they extend, with absolute
-paths.
-"""
+"""Config files: found by name or path, and merged with the files that they extend."""
 
 from __future__ import annotations
 
@@ -19,26 +17,26 @@ from rack.boards.errors import ConfigError, Mistake
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 """The bundled configs: next to this package in a checkout and in an installation."""
 FAULTS = CONFIGS / "faults"
-"""Bundled fault scripts, for `--faults`."""
+"""Folder of the bundled fault scripts, for `--faults`."""
 MAX_FILE_BYTES = 1_000_000
 LAN_ADAPTER = "rack.boards.lan.adapter:LanAdapter"
 """Class of the board that `[adapter.lan]` adds."""
 ANY = "*"
 STATE_TABLES = ("board", ANY, "params", "tables", ANY)
-"""Place of the files of levels' state tables; `ANY` stands for any key."""
+"""Keys under which levels name the files of their state tables. `ANY` stands for any key."""
 EXTENDS = "configs that this file extends, by name or path, in order; its own keys override theirs"
-"""Meaning of `extends`, the one key that only files have."""
+"""Meaning of the key `extends`, which files have and a loaded config does not."""
 
 
 @dataclass(frozen=True)
 class Assembled:
-    """The tables of a config as they were read.
+    """Tables of a config, merged from its files and settings but not yet validated.
 
     Attributes:
-        tables: The tables.
+        tables: The tables, with absolute paths.
         mistakes: Mistakes in files, fault script and settings.
-        broken: Tables that settings with mistakes were to change.
-        is_whole: False if files are missing, with tables that nobody knows.
+        broken: Tables that an invalid setting was meant to change.
+        is_whole: False if files could not be read, so that tables may be missing.
     """
 
     tables: Tables
@@ -50,8 +48,13 @@ class Assembled:
 def assembled(
     name_or_path: str | Path, overrides: Sequence[str], faults: str | Path | None
 ) -> Assembled:
-    """Return the tables of a config by name or path, with `key.sub=value` overrides and the faults
-    of a script. Paths in an override are relative to the current folder.
+    """Read a config's files and apply settings and a fault script. Mistakes are collected.
+
+    Args:
+        name_or_path: Name of a bundled config, or path of a TOML file.
+        overrides: Settings `key.sub=value`, applied in order. Paths in them are relative to the
+            current folder.
+        faults: Name or path of a fault script whose faults are appended. None for no script.
     """
     mistakes: list[Mistake] = []
     tables: Tables = {}
@@ -64,17 +67,17 @@ def assembled(
     if faults is not None:
         with gathering(mistakes):
             tables = with_faults(tables, faults, folder)
-    wrong: list[Mistake] = []
-    overridden = override(tables, overrides, wrong)
-    # Settings may refer to what only the files hold.
-    found = anchor(overridden if is_whole else tables, Path.cwd())
-    broken = frozenset(table_of(setting.value) for setting in wrong)
-    return Assembled(found, [*mistakes, *wrong], broken, is_whole)
+    invalid: list[Mistake] = []
+    overridden = override(tables, overrides, invalid)
+    # Without all files, settings cannot be judged: they may refer to tables of a missing file.
+    anchored = anchor(overridden if is_whole else tables, Path.cwd())
+    broken = frozenset(table_of(setting.value) for setting in invalid)
+    return Assembled(anchored, [*mistakes, *invalid], broken, is_whole)
 
 
 @contextmanager
 def gathering(mistakes: list[Mistake]) -> Iterator[None]:
-    """Add the mistakes of a `ConfigError` to a list."""
+    """Context in which a `ConfigError` ends the block and adds its mistakes to the list."""
     try:
         yield
     except ConfigError as error:
@@ -82,33 +85,37 @@ def gathering(mistakes: list[Mistake]) -> Iterator[None]:
 
 
 def named_classes(tables: Tables) -> tuple[str, ...]:
-    """Return the classes of levels that tables name, as "package.module:Class"; nothing else in
-    them is checked.
-    """
+    """Return the level classes that unvalidated tables name, as "package.module:Class"."""
     boards = [board for board in _table(tables, "board").values() if isinstance(board, dict)]
     names = [board.get(role) for board in boards for role in ("executor", "planner")]
     names += [LAN_ADAPTER] if "lan" in _table(tables, "adapter") else []
     return tuple(dict.fromkeys(name for name in names if isinstance(name, str)))
 
 
-def with_faults(tables: Tables, name_or_path: str | Path, own: Path) -> Tables:
-    """Return config tables with the faults of a script appended.
+def with_faults(tables: Tables, name_or_path: str | Path, folder: Path) -> Tables:
+    """Return the tables of a config with the faults of a script appended.
 
-    A script contains `[[fault]]` tables and nothing else. A name means a script in the folder of
-    the rack, `own`, if it has one of its own, else a bundled script. Raises `ConfigError`.
+    Args:
+        tables: Tables of the config.
+        name_or_path: Name or path of the script, which contains `[[fault]]` tables only. A name is
+            looked up in the rack's folder and then among the bundled scripts.
+        folder: Folder of the rack's config.
+
+    Raises:
+        ConfigError: The script cannot be read or contains something else.
     """
-    folders = [FAULTS] if own == CONFIGS else [own, FAULTS]
+    folders = [FAULTS] if folder == CONFIGS else [folder, FAULTS]
     path = _path(name_or_path, "--faults", *folders)
     script = _tables(path)
-    wrong = [
+    mistakes = [
         Mistake(
             f"{path.name}: {key}", None, "a fault script contains [[fault]] tables and nothing else"
         )
         for key, value in script.items()
         if key != "fault" or not isinstance(value, list)
     ]
-    if wrong:
-        raise ConfigError(wrong)
+    if mistakes:
+        raise ConfigError(mistakes)
     faults = tables.get("fault")
     if not isinstance(faults, list):
         faults = []
@@ -116,39 +123,42 @@ def with_faults(tables: Tables, name_or_path: str | Path, own: Path) -> Tables:
 
 
 def names(folder: Path = CONFIGS) -> list[str]:
-    """Return the names of the bundled racks, or of the configs in another folder.
+    """Return the names of the configs in a folder. The default is the folder of bundled racks.
 
-    A config is `<name>.toml`, or `<name>/<name>.toml`, next to its page. Other racks in that
-    folder, files with a name of their own, are `<name>/<rack>`.
+    The config `<name>` is the file `<name>.toml` or `<name>/<name>.toml`. Further files in that
+    subfolder that contain the key `name` are racks too, called `<name>/<file>`.
     """
-    found = [path.stem for path in folder.glob("*.toml")]
+    rack_names = [path.stem for path in folder.glob("*.toml")]
     for main in (path for path in folder.glob("*/*.toml") if path.stem == path.parent.name):
         racks = [
             path.stem
             for path in main.parent.glob("*.toml")
             if path == main or "name" in _tables(path)
         ]
-        found += [main.stem if rack == main.stem else f"{main.stem}/{rack}" for rack in racks]
-    return sorted(found)
+        rack_names += [main.stem if rack == main.stem else f"{main.stem}/{rack}" for rack in racks]
+    return sorted(rack_names)
 
 
 def file_at(path: Path) -> Path | None:
-    """Return the absolute path of a file, which need not be a regular one; None if it does not
-    exist or the path is invalid (unknown ~user).
+    """Return the absolute path of an existing file, regular or not.
+
+    Returns:
+        None if the file does not exist or the path is invalid, for instance with an unknown ~user.
     """
     try:
         path = path.expanduser()
         if path.is_file():
             return path.resolve()
-        # Keep the name as given: the file may be a link to a device.
+        # Do not resolve links, because the file may be a link to a device.
         return path.absolute() if path.exists() and not path.is_dir() else None
     except (OSError, RuntimeError, ValueError):
         return None
 
 
 def anchor(tables: Tables, folder: Path) -> Tables:
-    """Return the tables with absolute paths, resolved from `folder`, or for a bundled file from
-    configs/.
+    """Return tables with absolute paths, relative ones being resolved from `folder`.
+
+    A file that does not exist there is looked up among the bundled files, in configs/.
     """
 
     def find(text: str) -> str:
@@ -164,8 +174,13 @@ def anchor(tables: Tables, folder: Path) -> Tables:
 
 
 def with_texts(value: Any, keys: Sequence[str], change: Callable[[str], str]) -> Any:
-    """Return tables with `change` applied to the text at a place, or to each text of a list there;
-    whatever else is there stays.
+    """Return tables with some texts changed.
+
+    Args:
+        value: The tables.
+        keys: Path of the text, or of a list of texts. `ANY` matches every key. Values of other
+            types at this path stay as they are.
+        change: Function that returns the new text.
     """
     if keys and isinstance(value, dict):
         key, *rest = keys
@@ -179,34 +194,35 @@ def with_texts(value: Any, keys: Sequence[str], change: Callable[[str], str]) ->
 
 
 def _table(tables: Tables, key: str) -> Tables:
-    """Return the table of a key; an empty one if there is none, or something else."""
-    found = tables.get(key)
-    return found if isinstance(found, dict) else {}
+    """Return the table of a key. Empty if the key is missing or is not a table."""
+    table = tables.get(key)
+    return table if isinstance(table, dict) else {}
 
 
 def portable(model: Path) -> str:
-    """Return a model's path as written in a config: for a bundled model, relative to configs/."""
+    """Return a path as it is stored in a config. Paths of bundled files become relative."""
     return model.relative_to(CONFIGS).as_posix() if model.is_relative_to(CONFIGS) else str(model)
 
 
 def _path(name_or_path: str | Path, place: str, *folders: Path) -> Path:
+    """Return the file of a config or script. Raises `ConfigError` at `place` if it is not found."""
     text = str(name_or_path)
     is_path = isinstance(name_or_path, Path) or "/" in text or text.endswith(".toml")
     if is_path and (file := file_at(Path(text))):
         return file
-    # Only what is no file is looked for among the names: that reads every config.
+    # Look the text up among the names only if it is no file, because that reads every config.
     if is_path:
         known = [folder for folder in folders if text in names(folder)]
     else:
         known = [*folders, Path.cwd()]
-    found = next((file for folder in known if (file := _named(text, folder))), None)
-    if found is None:
+    named = next((file for folder in known if (file := _named(text, folder))), None)
+    if named is None:
         known_names = names(folders[-1])
         near = get_close_matches(text, known_names, 1)
-        by_name = f"by name: {', '.join(known_names)}; or a path"
-        why = f"did you mean '{near[0]}'?" if near else by_name
+        valid = f"valid are a path or one of the names {', '.join(known_names)}"
+        why = f"did you mean '{near[0]}'?" if near else valid
         raise ConfigError([Mistake(place, text, f"no such file; {why}")])
-    return found
+    return named
 
 
 def _read(
@@ -216,9 +232,9 @@ def _read(
 
     Args:
         path: The file.
-        chain: The files that extend it, directly or not.
-        known: Files read before, which may be extended more than once.
-        mistakes: Gets every mistake.
+        chain: The files that extend it, directly or indirectly.
+        known: Tables of the files read so far. A file may be extended more than once.
+        mistakes: List to which every mistake is added.
     """
     if path not in known:
         with gathering(mistakes):
@@ -233,20 +249,18 @@ def _merged(
         loop = " -> ".join(p.name for p in (*chain[chain.index(path) :], path))
         raise ConfigError([Mistake(f"{path.name}: extends", None, f"extends itself: {loop}")])
     if len(chain) >= MAX_DEPTH:
-        why = f"chain of extends too long; permitted: {MAX_DEPTH} files"
+        why = f"the chain of extended files is longer than {MAX_DEPTH} files"
         raise ConfigError([Mistake(f"{path.name}: extends", None, why)])
-    # Its own: a file may extend newer ones.
-    own = {"format": 1, **anchor(_tables(path), path.parent)}
+    # A file without a format has format 1, even if it extends files of a newer format.
+    top = {"format": 1, **anchor(_tables(path), path.parent)}
     merged: Tables = {}
-    for base in _bases(own.pop("extends", []), path, mistakes):
+    for base in _bases(top.pop("extends", []), path, mistakes):
         merged = _extended(merged, _read(base, (*chain, path), known, mistakes))
-    return _extended(merged, own)
+    return _extended(merged, top)
 
 
 def _extended(base: Tables, top: Tables) -> Tables:
-    """Return a file's tables merged over those it extends; a [robot] with its own model replaces
-    the arm.
-    """
+    """Return `base` updated with `top`. A `[robot]` that names a model replaces the whole arm."""
     if "model" in _table(top, "robot"):
         base = {key: value for key, value in base.items() if key != "robot"}
     return merge(base, top)
@@ -278,12 +292,10 @@ def _bases(extends: Any, path: Path, mistakes: list[Mistake]) -> list[Path]:
 
 
 def _named(name: str, folder: Path = CONFIGS) -> Path | None:
-    """Return the config of that name in a folder."""
+    """Return the file of a config by its name in a folder. None if it does not exist."""
     return file_at(folder / f"{name}.toml") or file_at(folder / name / f"{name}.toml")
 
 
 def _find(reference: str, folder: Path) -> Path | None:
-    """Return the file that a config in `folder` refers to: next to it, else among the bundled
-    ones.
-    """
+    """Return the file that a config in `folder` refers to, from there or from configs/."""
     return file_at(folder / reference) or file_at(CONFIGS / reference)

@@ -1,6 +1,4 @@
-"""Faults: whether their kind, their target and their time fit each other and the rack, and their
-entries in the fault table.
-"""
+"""Faults of a config: checks against their kinds and the rack, and entries of the fault table."""
 
 from __future__ import annotations
 
@@ -24,6 +22,7 @@ from rack.boards.faults.kind import KINDS, Kind, Parameter
 from rack.levels.tables import RobotConfig
 
 SEEDS = 2**31
+"""Number of possible seeds of a fault."""
 
 
 def fault_mistakes(
@@ -33,32 +32,29 @@ def fault_mistakes(
     layout: Layout | None = None,
     unspecified: Collection[str] = (),
 ) -> list[Mistake]:
-    """Check faults.
+    """Return every mistake in faults.
 
     Args:
         faults: The faults, with their places in a config. A live fault has an empty place.
         config: The config of the rack.
         levels: Its levels.
-        layout: Its layout. Without it the rules that need one are skipped.
-        unspecified: Boards with known mistakes.
-
-    Returns:
-        Every mistake.
+        layout: Its layout. None skips the checks that need one.
+        unspecified: Boards with known mistakes. What depends on them is not checked.
     """
     rules = [
         FaultRules(place, fault, config, levels, layout, unspecified) for place, fault in faults
     ]
-    found = [mistake for rule in rules for mistake in rule.mistakes()]
+    mistakes = [mistake for rule in rules for mistake in rule.mistakes()]
     if len(rules) > FAULT_ENTRIES:
-        found.append(
-            Mistake("fault", len(rules), f"too many faults for one run; permitted: {FAULT_ENTRIES}")
+        mistakes.append(
+            Mistake("fault", len(rules), f"too many faults; a run can have at most {FAULT_ENTRIES}")
         )
-    return found
+    return mistakes
 
 
 @dataclass(frozen=True)
 class FaultRules:
-    """The rules for one fault at `place`: see `fault_mistakes`."""
+    """Checks of one fault. The attributes are the arguments of `find_fault_mistakes`."""
 
     place: str
     fault: FaultConfig
@@ -69,12 +65,12 @@ class FaultRules:
 
     def mistakes(self) -> Mistakes:
         """Yield every mistake in the fault."""
-        # Check that its begin and its end are each given in one way.
+        # The beginning and the end must each be given in only one way.
         for keys in (("tick", "at", "when"), ("for", "cycles")):
-            given = [key for key in keys if self._value(key) is not None]
-            for key in given[1:]:
+            given_keys = [key for key in keys if self._value(key) is not None]
+            for key in given_keys[1:]:
                 yield self._mistake(
-                    key, f"{given[0]} is also given; permitted: one of {', '.join(keys)}"
+                    key, f"{given_keys[0]} is also given; give only one of {', '.join(keys)}"
                 )
         fault = self.fault
         places = (*self.config.tasks(), *self.config.hosts())
@@ -142,16 +138,16 @@ class FaultRules:
             yield self._mistake("mailbox", why)
 
     def _why_not_board(self, kind: Kind, tasks: Mapping[str, Role]) -> str:
-        """Return why the task cannot be struck by such a fault; empty if it can."""
+        """Return why a fault of this kind cannot strike the task. Empty if it can."""
         board = self.fault.board
         if board in self.config.host and self.config.host[board].external:
-            return "external: the rack has no process to strike; permitted: boards that it starts"
+            return "the rack does not start this external board, so it has no process to strike"
         if board == CLOCK:
             kinds = _listed(other.name for other in KINDS if "clock" in other.tasks)
             why = f"{kind.name} cannot strike the clock; kinds that can: {kinds}"
             return "" if "clock" in kind.tasks else why
         if kind.tasks == ("clock",):
-            return f'{kind.name} strikes only the clock; permitted: "{CLOCK}"'
+            return f'{kind.name} strikes only the clock; must be "{CLOCK}"'
         if tasks[board] not in kind.tasks:
             role = kind.tasks[0]
             fitting = _listed(name for name, other in tasks.items() if other == role)
@@ -160,7 +156,7 @@ class FaultRules:
             able = [
                 name
                 for name in self.config.board
-                # A level whose class is missing may be struck by any kind.
+                # A level whose class is missing is not checked.
                 if name not in self.levels or kind.name in self.levels[name].struck_by
             ]
             if board not in able:
@@ -168,41 +164,41 @@ class FaultRules:
         return ""
 
     def _layout_of(self, place: str) -> Layout | None:
-        """Return the layout; None without one, or if it lacks the board of a task or a mailbox."""
+        """Return the layout. None if there is none, or if it lacks the board of this place."""
         is_known = place.partition(".")[0].strip() not in self.unspecified
         return self.layout if is_known else None
 
     def _why_not_mailbox(self, kind: Kind) -> str:
-        """Return why such a fault cannot strike the mailboxes of the task; empty if it can."""
+        """Return why a fault of this kind cannot strike the task's mailboxes. Empty if it can."""
         board = self.fault.board
-        wanted = self.fault.mailbox
+        mailbox = self.fault.mailbox
         layout = self._layout_of(board)
         if layout is None or board == CLOCK or not kind.takes_mailbox:
             return ""
-        # The position of a queue's reader is not written through a port.
+        # The reader of a queue writes its position without a port, so only bus faults reach it.
         written = {
             m.name: m
             for m in layout.mailboxes
             if m.writer == board and (kind.where == "bus" or not is_position(m))
         }
-        struck = [m for m in written.values() if wanted in (None, m.name)]
-        if wanted is not None and not struck:
+        struck = [m for m in written.values() if mailbox in (None, m.name)]
+        if mailbox is not None and not struck:
             return f"'{board}' does not write it; it writes: {_listed(written)}"
         if kind.not_queued and struck and all(m.protocol == "queue" for m in struck):
             why = f"'{struck[0].name}' is a queue, which {kind.name} does not strike"
             return f"{why}: {kind.not_queued}"
-        # Readers may be among the boards that the layout lacks.
-        if kind.where == "bus" and wanted is None and not self.unspecified:
+        # If boards are missing from the layout, they may be the readers.
+        if kind.where == "bus" and mailbox is None and not self.unspecified:
             has_reader = any(m.readers for m in struck)
             return "" if has_reader else f"missing; no mailbox of '{board}' has a reader"
         locked = [m.name for m in written.values() if m.protocol == "lock"]
-        if kind.where == "lock" and (not locked or wanted not in (None, *locked)):
+        if kind.where == "lock" and (not locked or mailbox not in (None, *locked)):
             why = f"{kind.name} needs protocol lock; mailboxes of '{board}' that use it"
             return f"{why}: {_listed(locked)}"
         return ""
 
     def _without(self, keys: Iterable[str], why: str) -> Mistakes:
-        """Check that none of these keys is given."""
+        """Yield a mistake for each of these keys that is given."""
         for key in keys:
             if self._value(key) is not None:
                 yield self._mistake(key, why)
@@ -215,32 +211,43 @@ class FaultRules:
 
 
 def _range(parameter: Parameter, value: float, robot: RobotConfig | None) -> str:
-    """Return why a value is not permitted for the parameter; empty if it is."""
+    """Return why a value of the parameter is not valid. Empty if it is."""
     most = parameter.most
     if parameter.name == "joint" and robot is not None:
         most = len(robot.joints) - 1
     if not parameter.least <= value <= most or (parameter.is_whole and value != int(value)):
         whole = "whole numbers " if parameter.is_whole else ""
-        return f"out of range; permitted: {whole}{parameter.least:g} to {most:g}; {parameter}"
+        return f"out of range; valid: {whole}{parameter.least:g} to {most:g}; {parameter}"
     return ""
 
 
 def _listed(names: Iterable[str]) -> str:
+    """Return names separated by commas, or "none"."""
     return ", ".join(names) or "none"
 
 
 def places(config: RackConfig) -> list[tuple[str, FaultConfig]]:
-    """Return the faults of a config with their places in it."""
+    """Return each fault of a config with its place, as in "fault[0]"."""
     return [(f"fault[{at}]", fault) for at, fault in enumerate(config.fault)]
 
 
 def injections(config: RackConfig, layout: Layout) -> tuple[Injection, ...]:
-    """Return the entries of a config's own faults, already checked by `fault_mistakes`."""
+    """Return the fault table's entries for the faults of a checked config."""
     return tuple(_injection(fault, config, layout, place) for place, fault in places(config))
 
 
 def injection(fault: FaultConfig, config: RackConfig, levels: Levels, layout: Layout) -> Injection:
-    """Return the entry of a fault injected live. Raises `ConfigError` with every mistake."""
+    """Check a fault that is injected live and return its entry for the fault table.
+
+    Args:
+        fault: The fault.
+        config: Config of the running rack.
+        levels: Levels that the rack has published.
+        layout: Layout of its segment.
+
+    Raises:
+        ConfigError: The fault has mistakes. All of them are listed.
+    """
     if mistakes := fault_mistakes([("", fault)], config, levels, layout):
         raise ConfigError(mistakes)
     return _injection(fault, config, layout, "")
@@ -252,10 +259,10 @@ def _injection(fault: FaultConfig, config: RackConfig, layout: Layout, place: st
     task = -1 if fault.board == CLOCK else names.index(fault.board)
     seed = fault.seed
     if seed is None:
-        # Two faults of one config must not draw the same random numbers.
+        # Two faults of one config must draw different random numbers.
         seed = crc32(f"{config.seed} {place}".encode()) % SEEDS
     when = None if fault.when is None else condition(fault.when, layout)
-    # 0: until the end of the run, or it strikes once.
+    # Zero ticks mean until the end of the run, or that the fault strikes once.
     ticks = 0
     if fault.cycles is not None:
         ticks = fault.cycles * cycle_ticks(layout, fault.board)
@@ -277,13 +284,13 @@ def _injection(fault: FaultConfig, config: RackConfig, layout: Layout, place: st
 
 
 def _mailbox(fault: FaultConfig, kind: Kind, layout: Layout) -> int:
-    """Return the index of the mailbox; -1: all that the task writes, or none."""
+    """Return the index of the mailbox to strike. -1 if it is every one the task writes, or none."""
     if fault.mailbox is not None:
         return layout.index(fault.mailbox)
-    # One message is forged, in one mailbox: by default the first that has a reader.
-    forged = (
+    # A bus fault forges one message in one mailbox, by default the first that has a reader.
+    candidates = (
         at
         for at, box in enumerate(layout.mailboxes)
         if kind.where == "bus" and box.writer == fault.board and box.readers
     )
-    return next(forged, -1)
+    return next(candidates, -1)

@@ -1,6 +1,4 @@
-"""From the wiring of a rack to its layout: all mailboxes and tasks, as plain data for its
-segment.
-"""
+"""Layout of a rack, computed from its wiring: all tasks and mailboxes of its segment."""
 
 from __future__ import annotations
 
@@ -27,45 +25,48 @@ from rack.boards.config.protocols import UNREAD
 from rack.boards.config.schema import RackConfig, TaskPlace
 
 OPERATOR_DEPTH = 128
-"""Slots of an operator's mailbox; commands are rare."""
+"""Slots of an operator's mailbox. Few are needed, because commands are rare."""
 KEPT_S = 2.0
-"""Simulated time that mailboxes and trace rings retain for a recorder, which real-time boards may
-starve for 1 s."""
+"""Simulated time that mailboxes and trace rings retain.
+
+Real-time boards may starve a recorder for 1 s, in which it must lose nothing.
+"""
 SUSTAINED = 4
-"""Messages a cycle of the writer, on average, of which a recorder loses none however deep the queue
-is."""
+"""Average number of messages per cycle of a queue's writer that a recorder can follow.
+
+It limits the memory of deep queues.
+"""
 WORD_BYTES = 4
-"""Bytes of a word of `[protocol.interrupt]`: of the 68020's bus."""
+"""Bytes of one word in `[protocol.interrupt]`, the width of the 68020's bus."""
 NS_PER_US = 1e3
 NS_PER_MS = 1e6
 
 
 def obtained_core(core: int) -> int:
-    """Return the core for a task that requests `core`; cores that the machine lacks map to the
-    others in turn.
+    """Return the core on which a task runs that requests `core`.
+
+    A core that the machine lacks is replaced by one of the available cores, in turn.
     """
     available = sorted(os.sched_getaffinity(0))
     return core if core in available else available[core % len(available)]
 
 
 def shared_out(config: RackConfig) -> list[str]:
-    """Return a line for every requested core that does not exist, for the launch to print."""
-    wanted: dict[int, list[str]] = {config.clock.core: [CLOCK]}
+    """Return a note for every requested core that is not available and is replaced."""
+    requested: dict[int, list[str]] = {config.clock.core: [CLOCK]}
     for place in config.tasks():
-        wanted.setdefault(place.core, []).append(place.name)
+        requested.setdefault(place.core, []).append(place.name)
     available = ", ".join(map(str, sorted(os.sched_getaffinity(0))))
     return [
         f"core {core} is not available (available: {available}): core {obtained_core(core)} runs"
         f" {', '.join(tasks)}"
-        for core, tasks in sorted(wanted.items())
+        for core, tasks in sorted(requested.items())
         if obtained_core(core) != core
     ]
 
 
 def exchanges(wiring: Wiring, ports: TaskPorts) -> dict[str, ExchangeSpec]:
-    """Return how an executor reads the ports listed in its board's table, by port; times in
-    ticks.
-    """
+    """Return when an executor reads the ports of its `exchange` table, by port, in ticks."""
     board = ports.place.board
     every = wiring.every[board]
     phase = wiring.config.board[board].phase
@@ -78,7 +79,12 @@ def exchanges(wiring: Wiring, ports: TaskPorts) -> dict[str, ExchangeSpec]:
 
 
 class LayoutMaker:
-    """Makes the layout of a wiring without mistakes; `sizes` are the symbolic ones of messages."""
+    """Computes the layout of a wiring that has no mistakes.
+
+    Args:
+        wiring: The wiring.
+        sizes: Sizes that messages use by name, such as the number of joints.
+    """
 
     def __init__(self, wiring: Wiring, sizes: Mapping[str, int]) -> None:
         self._wiring = wiring
@@ -89,9 +95,9 @@ class LayoutMaker:
         self._hosts = {ports.task: self._host(ports.place) for ports in wiring.hosts}
 
     def layout(self) -> Layout:
-        """Return the layout."""
+        """Compute the layout."""
         mailboxes = [box for name in self._wiring.writers for box in self._written(name)]
-        # The clock passes an operator's commands on.
+        # The clock writes the operator's commands to the levels.
         mailboxes += [
             self._mailbox(name, writer=CLOCK, every=1, delay=1, depth=OPERATOR_DEPTH)
             for name in self._wiring.operated
@@ -101,13 +107,11 @@ class LayoutMaker:
         return Layout(self._config.name, self._config.clock_ns, tasks, tuple(mailboxes), hosts)
 
     def _written(self, name: str) -> Iterator[MailboxSpec]:
-        """Yield a mailbox that a task or host board writes; with a queue the one of its reader's
-        position.
-        """
+        """Yield a mailbox and, for a queue, the mailbox with the position of its reader."""
         ports, output = self._wiring.writers[name]
         capacity = self._config.protocol.depth.get(name, UNREAD)
         if name in self._wiring.from_host:
-            # The ring of a host board: a queue that is not by ticks.
+            # The ring of a host board is a queue that does not depend on ticks.
             depth = depth_for(capacity + SPARE, 1)
             yield self._mailbox(
                 name, writer=ports.task, every=1, delay=0, depth=depth, capacity=capacity
@@ -116,9 +120,9 @@ class LayoutMaker:
         writer = self._tasks[ports.task]
         every = writer.every * output.cycles
         delay = writer.slice
-        # A reader may read as late as the end of its slice a message that was visible at its start.
-        both = self._tasks | self._hosts
-        readers = [both[reader] for reader in self._wiring.readers(name)]
+        # A message that is visible at the start of a reader's slice must last until its end.
+        tasks_and_hosts = self._tasks | self._hosts
+        readers = [tasks_and_hosts[reader] for reader in self._wiring.readers(name)]
         slowest = max((reader.slice for reader in readers), default=0)
         box = self._mailbox(
             name,
@@ -136,7 +140,7 @@ class LayoutMaker:
         )
         if box.protocol == "interrupt":
             yield self._with_interrupts(box, writer, readers)
-        # A board with mistakes of its own may be its reader.
+        # A queue has no reader here if its reader's board has mistakes.
         elif box.protocol == "queue" and readers:
             yield from self._queue(box, capacity, readers[0], writer)
         else:
@@ -145,15 +149,20 @@ class LayoutMaker:
     def _queue(
         self, box: MailboxSpec, capacity: int, reader: TaskSpec, writer: TaskSpec
     ) -> Iterator[MailboxSpec]:
-        """Yield a queue with its size, and the mailbox in which its reader writes its position for
-        the writer.
+        """Yield a queue and the mailbox in which its reader reports its position to the writer.
+
+        Args:
+            box: The queue without its size.
+            capacity: Largest number of unread messages.
+            reader: The task that reads the queue.
+            writer: The task that writes it.
         """
         delay = reader.slice
         read = max((exchange.grid for exchange in box.exchanges), default=reader.grid)
-        # From its release until it can know what the reader has taken, the writer can send no more
-        # than the capacity.
+        # The writer learns the reader's position after both delays. In that time it can send no
+        # more messages than the capacity.
         most = capacity * (1 + self._kept // (box.delay + delay))
-        # A deep queue keeps fewer.
+        # A deep queue retains fewer messages, to limit its memory.
         slots = depth_for(min(most, 2 * capacity + SUSTAINED * self._kept // box.every), 1)
         yield replace(box, capacity=capacity, depth=slots)
         yield self._mailbox(
@@ -171,33 +180,37 @@ class LayoutMaker:
     def _with_interrupts(
         self, box: MailboxSpec, writer: TaskSpec, readers: Sequence[TaskSpec]
     ) -> MailboxSpec:
-        """Return a mailbox of protocol interrupt with what its messages cost, and when they are
-        sent and visible.
+        """Return a mailbox of protocol interrupt with the costs and times of its messages.
 
-        Between tasks of one slot, and into the network adapter, which reads shared memory, nothing
-        is interrupted.
+        Messages do not interrupt tasks of the writer's slot, host boards or the network adapter,
+        which read shared memory.
+
+        Args:
+            box: The mailbox, as for protocol time-slice.
+            writer: The task that writes it.
+            readers: The tasks that read it.
         """
         clock_ns = self._config.clock_ns
         table = self._config.protocol.interrupt
-        spared = {
+        uninterrupted = {
             task.slot
             for task in readers
             if task.role == "host" or self._wiring.is_of_network(task.board)
         }
         words = -(-box.size // WORD_BYTES)
         service_ns = round((table.fixed_us + table.word_us * words) * NS_PER_US)
-        # A plan is sent at the end of its slice, other messages when the budget is used up, or
-        # after a tick.
+        # A plan is sent at the end of its slice. Other messages are sent when the budget of the
+        # cycle is used up, or after one tick if there is no budget.
         sent_ns = writer.slice * clock_ns
         if writer.role != "planner":
             busy_ms = self._config.board[writer.board].busy_ms
             sent_ns = min(round(busy_ms * NS_PER_MS) or clock_ns, sent_ns)
-        slots = tuple(sorted({task.slot for task in readers} - spared - {writer.slot}))
+        slots = tuple(sorted({task.slot for task in readers} - uninterrupted - {writer.slot}))
         delay = -(-(sent_ns + service_ns * bool(slots)) // clock_ns)
         interrupt = InterruptSpec(
             sent_ns, service_ns, table.depth, -(-sent_ns // clock_ns), box.delay, slots
         )
-        # As late as it is served, a message is still in its slot.
+        # A message must still be in its slot when the last pending interrupt is served.
         waits = -(-(table.depth + 1) * service_ns // clock_ns)
         slowest = max((reader.slice for reader in readers), default=0)
         depth = depth_for(max(slowest + delay + waits, self._kept), box.every)
@@ -224,7 +237,7 @@ class LayoutMaker:
         )
 
     def _host(self, place: TaskPlace) -> TaskSpec:
-        """Return the record of a host board: it has no rate, and leaves no trace."""
+        """Return the record of a host board, which has no rate and no trace."""
         return TaskSpec(
             name=place.name,
             board=place.board,
@@ -238,14 +251,18 @@ class LayoutMaker:
             is_external=self._config.host[place.board].external,
         )
 
-    def _mailbox(self, name: str, kind: MessageType | None = None, **given: Any) -> MailboxSpec:
-        """Return the record of a mailbox: its message, readers and protocol, and the other fields
-        as given. `kind`: its message type, of a mailbox that is no port's.
+    def _mailbox(self, name: str, kind: MessageType | None = None, **fields: Any) -> MailboxSpec:
+        """Return the record of a mailbox.
+
+        Args:
+            name: Name of the mailbox.
+            kind: Its message type. None to take it from the port that writes the mailbox.
+            fields: Further fields of the record. They override readers, protocol and exchanges.
         """
         wiring = self._wiring
         kind = kind or wiring.types[name]
         reading = wiring.reading.get(name, ())
-        found = {
+        derived = {
             "readers": wiring.readers(name),
             "protocol": wiring.protocol(name),
             "exchanges": tuple(
@@ -258,13 +275,14 @@ class LayoutMaker:
             version=kind.version,
             size=kind.dtype(self._sizes).itemsize,
             fields=field_specs(kind, self._sizes),
-            **{**found, **given},
+            **{**derived, **fields},
         )
 
 
 def field_specs(kind: MessageType, sizes: Mapping[str, int]) -> tuple[FieldSpec, ...]:
-    """Return the fields of a message type with offsets, shapes and numpy types, for tools that
-    attach by name.
+    """Return the fields of a message type as plain data, with offsets, shapes and numpy types.
+
+    Tools that attach to a rack read messages by these records, without the message classes.
     """
     offsets: Mapping[str, Any] = kind.dtype(sizes).fields or {}
     specs = []
@@ -272,7 +290,7 @@ def field_specs(kind: MessageType, sizes: Mapping[str, int]) -> tuple[FieldSpec,
         dtype, offset = offsets[field.name][:2]
         scalar = dtype.base
         group = field.kind if isinstance(field.kind, MessageType) else None
-        # The numbers of an enum have names.
+        # The values of an enum have names.
         names = () if isinstance(field.unit, str) else field.unit
         specs.append(
             FieldSpec(

@@ -1,7 +1,7 @@
-"""From TOML to a config: files and settings are read, and each table is validated.
+"""Loading of configs: reads files and settings, and validates each table.
 
-What tables must agree on is checked by `rack.boards.config.resolved`, which also runs here when a
-table has mistakes, so that all mistakes are reported at once.
+`rack.boards.config.resolved` checks the tables against each other. It also runs here if a table
+has mistakes, so that all mistakes are reported at once.
 """
 
 from __future__ import annotations
@@ -30,28 +30,37 @@ T = TypeVar("T", bound=Table)
 def load(
     name_or_path: str | Path, overrides: Sequence[str] = (), faults: str | Path | None = None
 ) -> RackConfig:
-    """Return a config by name or path, with `key.sub=value` overrides, and add its levels to the
-    import path.
+    """Load a config and add the folders of its levels to the import path.
 
-    Faults of the script `faults`, by name or path, are appended to its own. Paths in an override
-    are relative to the current folder. Raises `ConfigError` with every mistake if a file, a setting
-    or a single table is wrong; `resolve` checks the rest.
+    This checks each table alone. `resolve` checks the tables against each other.
+
+    Args:
+        name_or_path: Name of a bundled config, or path of a TOML file.
+        overrides: Settings `key.sub=value`, applied in order. Paths in them are relative to the
+            current folder.
+        faults: Name or path of a fault script, whose faults are appended to the config's own.
+
+    Raises:
+        ConfigError: A file, a setting or a table is wrong. All mistakes are listed.
     """
     return validated(assembled(name_or_path, overrides, faults))
 
 
 def loads(text: str) -> RackConfig:
-    """Return the config in TOML text, as `RackConfig.text` writes it, and add its levels to the
-    import path. Raises `ConfigError` as `load` does.
+    """Load a config from TOML text, as `RackConfig.to_toml_text` writes it.
+
+    Like `load`, this extends the import path and raises `ConfigError` with every mistake.
     """
     return validated(Assembled(anchor(parse(text), CONFIGS)))
 
 
 def read_stored(text: str) -> RackConfig:
-    """Return the config that a rack or a run holds as text, which may be somebody else's.
+    """Read the config that a rack or a run stores as text, which may not be trusted.
 
-    Nothing that it names is imported, and its levels do not come into the import path. Raises
-    `ConfigError` with every mistake in a single table.
+    Nothing that the config names is imported, and the import path stays as it is.
+
+    Raises:
+        ConfigError: A table is wrong. All mistakes are listed.
     """
     tables = anchor(parse(text), CONFIGS)
     try:
@@ -60,16 +69,16 @@ def read_stored(text: str) -> RackConfig:
         raise ConfigError(mistakes_of(error, RackConfig, tables)) from None
 
 
-def validated(found: Assembled) -> RackConfig:
-    """Return the config in tables, and add its levels to the import path.
+def validated(assembly: Assembled) -> RackConfig:
+    """Validate the tables of a config, and add the folders of its levels to the import path.
 
     Raises:
-        ConfigError: The config has mistakes, those of its tables included. All stages run on the
-            tables that are valid.
+        ConfigError: The config has mistakes. Later checks still run on the valid tables, so that
+            all mistakes are listed.
     """
-    tables = found.tables
-    mistakes = list(found.mistakes)
-    broken = found.broken
+    tables = assembly.tables
+    mistakes = list(assembly.mistakes)
+    broken = assembly.broken
     try:
         config = RackConfig.model_validate(tables)
     except ValidationError as error:
@@ -77,11 +86,11 @@ def validated(found: Assembled) -> RackConfig:
         mistakes += [
             mistake
             for mistake in mistakes_of(error, RackConfig, tables)
-            # A setting or a file with mistakes may hold what is missing.
+            # A missing key may be in a file or setting that could not be read.
             if not mistake.why.startswith("missing")
-            or (found.is_whole and table_of(mistake.place) not in found.broken)
+            or (assembly.is_whole and table_of(mistake.place) not in assembly.broken)
         ]
-    if not found.is_whole:
+    if not assembly.is_whole:
         raise ConfigError(mistakes)
     if broken:
         config = _intact(tables, broken)
@@ -100,9 +109,7 @@ def validated(found: Assembled) -> RackConfig:
 
 
 def _readable(tables: Tables, key: str, kind: type[T]) -> Iterator[tuple[str, T]]:
-    """Yield place and table for the valid tables of a list; the mistakes of the others are already
-    known.
-    """
+    """Yield place and record of each valid table of a list. Invalid ones are already reported."""
     entries = tables.get(key)
     if not isinstance(entries, list):
         return
@@ -120,18 +127,20 @@ def _broken(error: ValidationError) -> frozenset[str]:
 
 
 def _intact(tables: Tables, broken: frozenset[str]) -> RackConfig:
-    """Return a config made of the tables without mistakes."""
-    kept = without({key: tables[key] for key in RackConfig.model_fields if key in tables}, broken)
-    # Stand-ins for required tables; nothing that depends on a broken table is checked.
-    spare = {"name": "unnamed", "clock": {"period_ms": 1}}
-    none = {"unnamed": {"slot": LAST_SLOT, "every": 1, "executor": "unnamed:Unnamed"}}
-    config = RackConfig.model_validate({**spare, **kept, "board": kept["board"] or none})
-    return config if kept["board"] else config.model_copy(update={"board": {}})
+    """Return a config that consists of the tables without mistakes."""
+    valid = without({key: tables[key] for key in RackConfig.model_fields if key in tables}, broken)
+    # Placeholders for required tables: nothing that depends on a broken table is checked.
+    required = {"name": "unnamed", "clock": {"period_ms": 1}}
+    board = {"unnamed": {"slot": LAST_SLOT, "every": 1, "executor": "unnamed:Unnamed"}}
+    config = RackConfig.model_validate({**required, **valid, "board": valid["board"] or board})
+    return config if valid["board"] else config.model_copy(update={"board": {}})
 
 
 def _with_derived(config: RackConfig) -> RackConfig:
-    """Return a config whose arm has joints, tool and home, its model's where it says nothing.
-    Raises `ConfigError`.
+    """Return the config with joints, tool and home of the arm taken from its model if not given.
+
+    Raises:
+        ConfigError: The model does not provide them.
     """
     robot = config.robot
     if robot is None or (robot.joints and robot.tool and robot.home):

@@ -1,4 +1,7 @@
-"""Mistakes that pydantic finds in a single table; those between tables are found by the rules."""
+"""Mistakes within a single table, as pydantic finds them.
+
+The rules in `rack.boards.config.rules` find the mistakes between tables.
+"""
 
 from __future__ import annotations
 
@@ -19,19 +22,24 @@ HINTS = {
         "; a [robot] with its own model is a different arm and inherits nothing from extended files"
     )
 }
-"""Hints for tables that lack a key."""
+"""Hints by table, for an error about a missing key."""
 
 
 def mistakes_of(
     error: ValidationError, model: type[BaseModel], tables: Any, place: str = ""
 ) -> list[Mistake]:
-    """Return the mistakes of `tables`, which are at `place` in the config and failed validation as
-    `model`.
+    """Convert a validation error of pydantic into mistakes.
+
+    Args:
+        error: The error.
+        model: The model that was to validate the tables.
+        tables: The tables.
+        place: Place of the tables in the config. Empty for the whole config.
     """
-    found = [_mistake(entry, model, tables, place) for entry in error.errors(include_url=False)]
-    # A value that may have several types yields a mistake for each type: keep the first, or that of
-    # its item.
-    first = {mistake.place: mistake for mistake in reversed(found)}
+    reports = [_mistake(entry, model, tables, place) for entry in error.errors(include_url=False)]
+    # pydantic reports a value of a union once for each member type. Keep the first report for each
+    # place, and drop a report about a container if there is one about a value inside it.
+    first = {mistake.place: mistake for mistake in reversed(reports)}
     within = {
         place
         for place in first
@@ -45,11 +53,13 @@ def _mistake(entry: ErrorDetails, model: type[BaseModel], tables: Any, place: st
     where = (
         place + "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in keys)
     ).lstrip(".")
-    if entry["type"].startswith("union_tag"):  # a table of several kinds, selected by one key
-        about = entry["ctx"]
-        permitted = about.get("expected_tags", "").replace("'", "")
-        why = f"permitted: {permitted}" if permitted else "missing; it selects the kind of table"
-        return Mistake(f"{where}.{about['discriminator'].strip(chr(39))}", about.get("tag"), why)
+    # A table of several kinds, selected by the value of one key.
+    if entry["type"].startswith("union_tag"):
+        context = entry["ctx"]
+        valid = context.get("expected_tags", "").replace("'", "")
+        why = f"valid values: {valid}" if valid else "missing; it selects the kind of table"
+        # pydantic puts the name of the key in quotes.
+        return Mistake(f"{where}.{context['discriminator'][1:-1]}", context.get("tag"), why)
     known, field = _declared(model, keys, tables)
     meaning = f"; {field.description}" if field is not None and field.description else ""
     if entry["type"] == "missing":
@@ -70,7 +80,7 @@ def _mistake(entry: ErrorDetails, model: type[BaseModel], tables: Any, place: st
 
 
 def _keys(loc: tuple[int | str, ...], table: Any, is_missing: bool) -> list[int | str]:
-    """Return the keys of a location without the names of variants that pydantic inserts."""
+    """Return the keys of a location, without the names of union members that pydantic inserts."""
     keys: list[int | str] = []
     for key in loc:
         in_list = isinstance(table, list) and isinstance(key, int) and key < len(table)
@@ -83,9 +93,7 @@ def _keys(loc: tuple[int | str, ...], table: Any, is_missing: bool) -> list[int 
 def _declared(
     model: type[BaseModel], keys: list[int | str], table: Any
 ) -> tuple[list[str], FieldInfo | None]:
-    """Return the names of all keys of the table that contains the last of `keys`, and that key's
-    field.
-    """
+    """Return the valid keys of the table that contains the last of `keys`, and that key's field."""
     models = [model]
     known = dict[str, FieldInfo]()
     field = None
@@ -94,11 +102,13 @@ def _declared(
         models = [kind for kind in models if _fits(kind, table)] or models
         try:
             table = table[key]
-        except (LookupError, TypeError):  # missing, or not a table
+        except (LookupError, TypeError):
+            # The key is missing, or its parent is not a table.
             table = None
         if isinstance(key, int):
             continue
-        if is_name:  # the name of a table among tables of one type, as in [board.servo]
+        if is_name:
+            # The user's name of a table, as "servo" in [board.servo].
             is_name = False
             continue
         known = {name: f for kind in models for name, f in keys_of(kind).items()}
@@ -109,9 +119,7 @@ def _declared(
 
 
 def _fits(kind: type[BaseModel], table: Any) -> bool:
-    """Say whether a table may be of this kind, judged by its keys with fixed values, as in do =
-    "goto".
-    """
+    """Return True if a table may be of a kind, judged by keys with fixed values (do = "goto")."""
     fixed = {
         key: get_args(f.annotation)
         for key, f in kind.model_fields.items()
@@ -123,7 +131,7 @@ def _fits(kind: type[BaseModel], table: Any) -> bool:
 
 
 def _models(annotation: Any) -> Iterator[type[BaseModel]]:
-    """Yield the tables in a type, as in `tuple[Transfer | Goto, ...]`."""
+    """Yield the models that occur in a type such as `tuple[Transfer | Goto, ...]`."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         yield annotation
     for part in get_args(annotation):
@@ -137,12 +145,10 @@ def repeated(place: str, names: Iterable[str]) -> Iterator[Mistake]:
 
 
 def repeats(names: Iterable[str]) -> Iterator[tuple[str, int]]:
-    """Yield every name that comes more than once, and how often."""
+    """Yield each name that occurs more than once, with the number of its occurrences."""
     return ((name, count) for name, count in Counter(names).items() if count > 1)
 
 
 def at_key(place: str, key: str) -> str:
-    """Return the place of a key of a table; what was not given in a config has no place of its
-    own.
-    """
+    """Return the place of a key in the table at `place`, which is empty outside a config."""
     return f"{place}.{key}" if place else key

@@ -1,4 +1,4 @@
-"""The table of the mailboxes' protocols."""
+"""The table `[protocol]`: protocols of the mailboxes."""
 
 from __future__ import annotations
 
@@ -17,28 +17,28 @@ MOST_UNREAD = 4096
 
 
 class InterruptConfig(Table):
-    """`[protocol.interrupt]`: the cost of messages that interrupt the boards that read them."""
+    """`[protocol.interrupt]`: cost of the messages that interrupt their readers."""
 
     fixed_us: Microseconds = 50.0
-    """time of the interrupt handler for a message of no words, us"""
+    """time of the interrupt handler for an empty message [us]"""
     word_us: Microseconds = 1.0
-    """its time for every word of 4 bytes, us"""
+    """additional time of the handler for each word of 4 bytes [us]"""
     depth: int = Field(16, ge=1, le=MOST_UNREAD)
-    """largest number of interrupts that wait at one board; others are lost"""
+    """largest number of pending interrupts at one board; further ones are lost"""
 
 
 class ProtocolConfig(Table):
-    """`[protocol]`: how mailboxes are shared."""
+    """`[protocol]`: when messages become visible to their readers."""
 
     default: Sampled = "time-slice"
     """protocol of every mailbox not listed under mailbox"""
     mailbox: dict[MailboxName, Protocol] = {}
-    """protocol by mailbox; queue: its one reader gets every message, in order; interrupt: every
+    """protocol by mailbox; queue: its only reader gets every message, in order; interrupt: every
     message interrupts the boards that read it"""
     interrupt: InterruptConfig = InterruptConfig()
-    """protocol interrupt: its cost"""
+    """cost of messages under the protocol interrupt"""
     strict: bool = False
-    """refuse whatever makes a run depend on timing"""
+    """refuse everything that makes a run depend on timing"""
     depth: dict[MailboxName, Annotated[int, Field(ge=1, le=MOST_UNREAD)]] = Field(
         {}, description=f"largest number of unread messages, by queue; default: {UNREAD}"
     )

@@ -1,8 +1,8 @@
-"""Facts about a rack's levels, published as plain data for everything that is not the rack itself.
+"""Facts about the levels of a rack, published as plain data for tools.
 
-They are gathered from the levels' classes when the rack is launched, and stand as text in its
-segment and in the folders of its runs. What looks at a rack or a run, or commands it, reads them
-there: it imports no class that a config names, since that would run the code of whoever wrote it.
+The launch gathers them from the levels' classes and stores them as text in the segment and in run
+folders. Tools that show or command a rack read this text. They never import the classes that a
+config names, because that would run code of whoever wrote the config.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from rack.levels.operator import NAMED, Goal, Operation
 from rack.levels.tables import Table, keys_of, live_keys, read_params
 
 TYPES: Mapping[str, type] = {kind.__name__: kind for kind in (bool, int, float, str)}
-"""Types of parameters whose values can be checked without the level's class."""
+"""Parameter types, by name, whose values can be checked without the level's class."""
 Constraint = Literal["gt", "ge", "lt", "le", "allow_inf_nan"]
 
 
@@ -38,10 +38,10 @@ class PublishedParam:
     """A parameter that an operator may set while its level runs.
 
     Attributes:
-        kind: Name of its type in `TYPES`. Empty: the level alone can check its values.
-        meaning: Its meaning, with its unit.
-        constraints: Bounds of its values, by the names that pydantic has for them.
-        launched: Its value at the launch, as text.
+        kind: Name of its type. Only the level can check values of types not in `TYPES`.
+        meaning: Meaning, with the unit.
+        constraints: Bounds of its values, by their names in pydantic.
+        launched: Value at the launch, as text.
     """
 
     kind: str
@@ -52,7 +52,7 @@ class PublishedParam:
 
 @dataclass(frozen=True)
 class PublishedFinding:
-    """An event of its own that a level may report: see `rack.levels.ports.FindingKind`."""
+    """Event that a level declares and may report: see `rack.levels.ports.FindingKind`."""
 
     name: str
     unit: str
@@ -61,17 +61,17 @@ class PublishedFinding:
 
 @dataclass(frozen=True)
 class PublishedLevel:
-    """A level, as its operator and the injector of faults know it.
+    """Facts about a level that its operator and fault injection need.
 
     Attributes:
-        commands: The operator's commands that it takes, with the forms of their goals.
-        wording: Names that each command with a name may give. A command is missing if its names are
-            not known.
+        commands: Operator commands that it takes, with the valid forms of their goals.
+        wording: Valid names for each command that takes a name. A command is left out if its names
+            are not known.
         names: See `Executor.names`.
         keys: Keys of all its parameters.
         live: Its live parameters by key.
-        struck_by: Kinds of faults that can strike the hardware that it drives.
-        findings: Events of its own that it may report, in the order of their numbers.
+        struck_by: Fault kinds that can strike the hardware that it drives.
+        findings: Events that it declares, in the order of their numbers.
     """
 
     commands: Mapping[Operation, tuple[Goal, ...]] = field(default_factory=dict)
@@ -84,7 +84,7 @@ class PublishedLevel:
 
     @property
     def table(self) -> type[Table]:
-        """A table that checks the values of live parameters."""
+        """Model that checks values of the live parameters and accepts any other parameter."""
         fields: dict[str, Any] = dict.fromkeys(self.keys, (Any, None))
         for key, param in self.live.items():
             constraints: Any = param.constraints
@@ -94,34 +94,34 @@ class PublishedLevel:
 
 
 Levels = Mapping[str, PublishedLevel]
-"""Levels by board; those whose classes are missing are omitted."""
+"""Levels by board. Levels whose classes are missing are left out."""
 
 
 @dataclass(frozen=True)
 class PublishedRack:
-    """The levels of a rack, and the kinds of faults that their modules add."""
+    """Levels of a rack, and the fault kinds that their modules add."""
 
     levels: Levels = field(default_factory=dict)
     kinds: tuple[Kind, ...] = ()
 
     def text(self) -> str:
-        """Return it as text, without the parts of kinds that are code."""
+        """Return the record as JSON, without the parts of fault kinds that are code."""
         return encode_json(ADAPTER.dump_python(self, exclude=CODE))
 
     @classmethod
     def read(cls, text: str) -> PublishedRack:
-        """Return what a text contains. Its kinds of faults are known to this process from now on.
+        """Read a record from JSON and register its fault kinds in this process.
 
         Raises:
-            ValueError: The text is no such record.
+            ValueError: The text is not such a record.
         """
-        found = ADAPTER.validate_json(text)
-        KINDS.adopt(found.kinds)
-        return found
+        published = ADAPTER.validate_json(text)
+        KINDS.adopt(published.kinds)
+        return published
 
     @classmethod
     def of_rack(cls, segment: Segment) -> PublishedRack:
-        """Return what a rack has published. Raises `SegmentError`."""
+        """Read the record that a rack has published. Raises `SegmentError` if it is not valid."""
         try:
             return cls.read(segment.published)
         except ValueError as error:
@@ -140,40 +140,41 @@ CODE: Any = {
         }
     }
 }
-"""Fields that are left out, because they hold functions or classes."""
+"""Fields that are not published because they contain functions or classes."""
 
 
 def publish(config: RackConfig) -> PublishedRack:
-    """Gather the facts about a rack's levels from their classes, which are imported."""
+    """Gather the facts about the levels of a rack. This imports their classes."""
     levels = {name: _level(config, name, kind) for name, kind in executors(config).items()}
     return PublishedRack(levels, tuple(kind for kind in KINDS if kind.name not in BUILT_IN))
 
 
 def _level(config: RackConfig, board: str, kind: type[Executor]) -> PublishedLevel:
     commands = kind.commands if takes_commands(kind) else {}
-    given = config.board[board].params
+    params = config.board[board].params
     live: dict[str, PublishedParam] = {}
     if kind.params is not None and (keys := live_keys(kind.params)):
         declared = keys_of(kind.params)
         launched = None
-        # Of parameters with mistakes, which are reported elsewhere, no value is known.
+        # Parameters with mistakes have no values. The mistakes are reported by the rules.
         with suppress(LevelError):
-            launched = read_params(kind.params, given)
+            launched = read_params(kind.params, params)
         live = {key: _param(declared[key], getattr(launched, key, "")) for key in keys}
     wording = {Operation.SET: tuple(live)}
     for what in commands.keys() & {*NAMED} - {Operation.SET}:
-        # A table may be in the middle of being edited.
+        # A state table may be invalid while it is being edited.
         with suppress(LevelError):
-            wording[what] = tuple(kind.wording(what, given, config.scene))
+            wording[what] = tuple(kind.wording(what, params, config.scene))
     return PublishedLevel(
         commands={what: tuple(goals) for what, goals in commands.items()},
         wording=wording,
-        names=tuple(kind.names(given)),
+        names=tuple(kind.names(params)),
         keys=() if kind.params is None else tuple(kind.params.model_fields),
         live=live,
         struck_by=tuple(k.name for k in KINDS if isinstance(k.step, kind.faults)),
         findings=tuple(
-            PublishedFinding(one.name, one.unit, one.doc) for one in kind.finding_kinds.values()
+            PublishedFinding(finding.name, finding.unit, finding.doc)
+            for finding in kind.finding_kinds.values()
         ),
     )
 
@@ -183,7 +184,7 @@ def _param(declared: FieldInfo, launched: object) -> PublishedParam:
     for bound in declared.metadata:
         for key in get_args(Constraint):
             value = getattr(bound, key, None)
-            # An infinite bound is none, and JSON has no infinity.
+            # An infinite bound does not limit anything, and JSON cannot represent it.
             if value is not None and isfinite(value):
                 constraints[key] = value if isinstance(value, bool) else float(value)
     kind = getattr(declared.annotation, "__name__", "")

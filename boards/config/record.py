@@ -1,4 +1,4 @@
-"""`[record]`: what is kept of a run; by default everything."""
+"""The table `[record]`: how much of a run the recorder keeps. By default everything."""
 
 from __future__ import annotations
 
@@ -14,23 +14,26 @@ Stretch = Annotated[float, Field(ge=1, le=1e6, allow_inf_nan=False), BeforeValid
 
 
 class RecordConfig(Table):
-    """`[record]`: with `keep`, a flight recorder, which keeps the last stretch of a run, and for
-    good what surrounds a fault, a detection, a miss, a hold, a restart or a lost row.
+    """`[record]`: flight recorder, if `keep` is given.
+
+    It keeps the last part of a run, and permanently the time around each fault, detection, missed
+    cycle, hold, restart and lost row.
     """
 
     keep: Stretch | None = None
-    """last stretch kept, s; simulated time; also as in "10 min" or "30 s"; default: all"""
+    """time at the end of the run that is kept [s]; simulated time; also as in "10 min" or "30 s";
+    default: all"""
     before: Span = 5.0
-    """kept before each of these, s; also as in "5 s" """
+    """time kept before each such event [s]; also as in "5 s" """
     after: Span = 5.0
-    """kept after each of these, s; also as in "5 s" """
+    """time kept after each such event [s]; also as in "5 s" """
 
     @model_validator(mode="after")
     def _remembers(self) -> Self:
-        """Refuse to remove what a window may still need: a fault may be found late."""
+        """Require that rows are kept until they may be needed: faults can be detected late."""
         if self.keep is not None and self.keep < self.before + self.after:
             raise ValueError(
                 f"keep = {self.keep:g} s is shorter than before + after ="
-                f" {self.before + self.after:g} s: what is before a fault would be gone"
+                f" {self.before + self.after:g} s; rows from before a fault would be lost"
             )
         return self

@@ -1,13 +1,11 @@
-"""Every key of a config with type, unit, range, default and meaning, from the models that validate
-it.
+"""Reference of all config keys, generated from the models that validate a config.
 
-`[task]` and the tables `params` of boards are declared by the levels' classes, so those tables
-depend on the config.
+Each key has a type, unit, range, default and meaning. The classes of the levels declare `[task]`
+and the `params` of boards, so these tables depend on the config.
 """
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -25,24 +23,27 @@ from rack.boards.faults.kind import KINDS
 from rack.levels.ports import FindingKind
 from rack.levels.tables import keys_of
 
-UNIT = re.compile(
-    r", ((?:kg m2|N s/m|N/\(m s\)|N/m|N m/rad|N"
-    r" m|N|rad/s[23]?|rad|m/s|mm|m|ms|us|1/s|s|Hz|ticks|cycles)"
-    r"(?: or (?:rad/s|rad|N m s/rad|N m/rad|N m))?)(?=$|[;:,])"
-)
-"""The unit in a description: between a comma and the end, or further punctuation."""
 REQUIRED = "required"
 NAME = ".<name>"
 LEAST = {"minimum": "at least", "exclusiveMinimum": "above"}
 MOST = {"maximum": "at most", "exclusiveMaximum": "below"}
-"""Bounds of a number, as JSON schema calls them, and in words; the first one counts."""
+"""Bounds of a number by their names in JSON schema, in words. The first bound present is used."""
 
 Schema = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
 class Key:
-    """One key of a table. Empty texts: no unit, any value permitted, no default."""
+    """One key of a table.
+
+    Attributes:
+        name: Name of the key.
+        type: Type of its value, as in "list of numbers".
+        unit: Unit of its value. Empty if it has none.
+        permitted: Valid values. Empty if any value of the type is valid.
+        default: Default value as text, or "required". Empty if the key may be left out.
+        meaning: What the key does.
+    """
 
     name: str
     type: str
@@ -54,7 +55,14 @@ class Key:
 
 @dataclass(frozen=True)
 class KeyTable:
-    """One table of a config: name, as in "board.budget", TOML heading, meaning and keys."""
+    """One table of a config.
+
+    Attributes:
+        name: Name for look-ups, as in "board.budget".
+        heading: Its heading in TOML, as in "[board.<name>.budget]".
+        meaning: What the table describes.
+        keys: Its keys, in the order of their declaration.
+    """
 
     name: str
     heading: str
@@ -63,63 +71,67 @@ class KeyTable:
 
 
 class DescribedSchema(GenerateJsonSchema):
-    """The JSON schema of a table, with the descriptions of its keys."""
+    """Generator of JSON schemas that include the description of each key."""
 
     def model_schema(self, schema: ModelSchema) -> JsonSchemaValue:
-        """Return the schema of one table."""
-        found = super().model_schema(schema)
+        """Return the JSON schema of one table."""
+        json_schema = super().model_schema(schema)
         for key, field in keys_of(schema["cls"]).items():
-            found["properties"][key]["description"] = field.description or ""
-        return found
+            json_schema["properties"][key]["description"] = field.description or ""
+        return json_schema
 
 
 def key_tables(config: RackConfig) -> list[KeyTable]:
-    """Return every table that a config of these boards may contain. Raises `ConfigError` for a
-    missing class.
+    """Return every table that a config with these boards may contain.
+
+    Raises:
+        ConfigError: A class that the config names does not exist.
     """
     wiring = Wiring(config)
     if mistakes := [*ports(wiring), *exchange(wiring)]:
         raise ConfigError(mistakes)
-    whole, *found = _tables(RackConfig, "")
+    top, *tables = _tables(RackConfig, "")
     extends = Key("extends", "list of strings", "", "", "", EXTENDS)
-    whole = KeyTable("rack", "(top of the file)", whole.meaning, (extends, *whole.keys))
-    found = [whole, *found, *_fault_kinds()]
+    top = KeyTable("rack", "(top of the file)", top.meaning, (extends, *top.keys))
+    tables = [top, *tables, *_fault_kinds()]
     for program in wiring.programs:
-        found += _tables(program, "task")
+        tables += _tables(program, "task")
     for board, params in wiring.params:
-        # Of the network adapter's board the table is `[adapter.lan]`.
+        # The parameters of the network adapter are written in `[adapter.lan]`.
         if config.adapter.lan is None or board != f"board.{LAN}":
-            found += _tables(params, f"{board}.params")
-    found += [
+            tables += _tables(params, f"{board}.params")
+    tables += [
         _findings(board, kind.finding_kinds)
         for board, kind in executors(config).items()
         if kind.finding_kinds
     ]
-    return found
+    return tables
 
 
 def find_tables(name: str, config: RackConfig) -> list[KeyTable]:
-    """Return the table `name`, or all whose names begin with it. Raises `LookupError` with the
-    existing tables.
+    """Return the table of a name, or else all tables whose names begin with it.
+
+    Raises:
+        LookupError: No table has such a name. The message lists the tables.
     """
-    known = {found.name: found for found in key_tables(config)}
+    known = {table.name: table for table in key_tables(config)}
     parts = name.strip("[]").split(".")
     tables = [".".join(parts)]
     if (
         parts[0] in ("board", "host")
         and len(parts) > 1
-        and (parts[1] in (*getattr(config, parts[0]), "<name>"))
+        and parts[1] in (*getattr(config, parts[0]), "<name>")
     ):
-        # What all boards have in common is described once.
+        # The keys that all boards have in common are described once, without a name.
         tables.append(".".join(parts[:1] + parts[2:]))
     for table in tables:
         if table in known:
             return [known[table]]
-    if found := [known[name] for name in known if name.startswith(f"{tables[-1]}.")]:
-        return found
+    if inner := [known[name] for name in known if name.startswith(f"{tables[-1]}.")]:
+        return inner
     top = dict.fromkeys(name.partition(".")[0] for name in known)
     raise LookupError(
-        f"no such table; tables: {', '.join(top)}, and others listed by 'rack schema'"
+        f"no such table; tables: {', '.join(top)}, and others that 'rack schema' lists"
     )
 
 
@@ -129,14 +141,14 @@ def _tables(model: type[BaseModel], path: str) -> Iterator[KeyTable]:
 
 
 def _walk(schema: Schema, known: Schema, name: str, path: str, heading: str) -> Iterator[KeyTable]:
-    """Yield a table, then those in it."""
+    """Yield the table that a schema describes, followed by the tables inside it."""
     keys = []
     inner: list[KeyTable] = []
     for key, entry in schema.get("properties", {}).items():
         below = f"{path}.{key}".lstrip(".")
-        found = [*_inner(entry, known, f"{name}.{key}".lstrip("."), below, f"[{below}]")]
-        inner += found
-        if not found:
+        tables = [*_inner(entry, known, f"{name}.{key}".lstrip("."), below, f"[{below}]")]
+        inner += tables
+        if not tables:
             keys.append(_key(key, entry, key in schema.get("required", ())))
     if keys:
         yield KeyTable(name, heading, _summary(schema.get("description", "")), tuple(keys))
@@ -144,7 +156,7 @@ def _walk(schema: Schema, known: Schema, name: str, path: str, heading: str) -> 
 
 
 def _inner(entry: Schema, known: Schema, name: str, path: str, heading: str) -> Iterator[KeyTable]:
-    """Yield the tables that a value may be or contain."""
+    """Yield the tables that a value of this schema may be, or may contain."""
     if "$ref" in entry:
         yield from _walk(known[entry["$ref"].rpartition("/")[2]], known, name, path, heading)
     for option in entry.get("anyOf", ()):
@@ -155,35 +167,37 @@ def _inner(entry: Schema, known: Schema, name: str, path: str, heading: str) -> 
         yield from _inner({"$ref": ref}, known, f"{name}.{value}", path, chosen)
     if isinstance(entry.get("items"), dict):
         yield from _inner(entry["items"], known, name, path, f"[[{path}]]")
-    for held in _named(entry):
-        yield from _inner(held, known, name, f"{path}{NAME}", f"[{path}{NAME}]")
+    for value_schema in _named(entry):
+        yield from _inner(value_schema, known, name, f"{path}{NAME}", f"[{path}{NAME}]")
 
 
 def _named(entry: Schema) -> Iterator[Schema]:
-    """Yield the schemas of the values of a table whose keys are names of the user's own."""
-    held = (entry.get("additionalProperties"), *entry.get("patternProperties", {}).values())
-    yield from (found for found in held if isinstance(found, dict))
+    """Yield the schemas of the values in a table whose keys are chosen by the user."""
+    values = (entry.get("additionalProperties"), *entry.get("patternProperties", {}).values())
+    yield from (value for value in values if isinstance(value, dict))
 
 
 def _key(name: str, entry: Schema, is_required: bool) -> Key:
-    description = entry.get("description", "")
-    unit = UNIT.search(description)
-    given = entry.get("default")
-    default = "" if given in (None, [], {}) else shown(given)
+    # A description declares the unit in brackets, as in "tick period [ms]; a whole number of ns".
+    before, _, rest = entry.get("description", "").partition(" [")
+    unit, _, after = rest.partition("]")
+    default = entry.get("default")
+    default_text = "" if default in (None, [], {}) else shown(default)
     kind, permitted = _values(entry)
     return Key(
         name=name,
         type=kind,
-        unit=unit[1] if unit else "",
+        unit=unit,
         permitted=permitted[0] if permitted else "",
-        default=REQUIRED if is_required else default,
-        meaning=UNIT.sub("", description, count=1) + "; live: `rack set`" * ("live" in entry),
+        default=REQUIRED if is_required else default_text,
+        meaning=before + after + "; live: `rack set`" * ("live" in entry),
     )
 
 
 def _values(entry: Schema) -> tuple[str, list[str]]:
-    """Return the type of a value, and the permitted values of each of its alternatives that has
-    limits; of a list or table of like items, those of the items.
+    """Return the type of a value and, for each alternative type with limits, its valid values.
+
+    For a list or table of equal items, the limits are those on each item.
     """
     kinds = []
     limits = []
@@ -192,12 +206,12 @@ def _values(entry: Schema) -> tuple[str, list[str]]:
         kind = {"array": "list", "object": "table"}.get(kind, kind)
         listed = option.get("prefixItems", ())
         places = (option.get("items"), *listed, *_named(option))
-        held = next((found for found in places if isinstance(found, dict)), None)
-        if held is None:
+        item = next((place for place in places if isinstance(place, dict)), None)
+        if item is None:
             permitted = _limits(option)
         else:
-            of, inner = _values(held)
-            first, _, rest = of.partition(" ")
+            item_type, inner = _values(item)
+            first, _, rest = item_type.partition(" ")
             count = f"{len(listed)} " if listed else ""
             kind = f"{kind} of {count}{first}s {rest}".rstrip()
             if "maxItems" in option and "items" in option:
@@ -210,7 +224,7 @@ def _values(entry: Schema) -> tuple[str, list[str]]:
 
 
 def _limits(entry: Schema) -> str:
-    """Return the permitted values of a value that contains no others."""
+    """Return the valid values of a number, text or truth value as text. Empty without limits."""
     if values := entry.get("enum", [entry["const"]] if "const" in entry else []):
         return ", ".join(map(shown, values))
     if {"minimum", "maximum"} <= entry.keys():
@@ -230,12 +244,12 @@ def _number(value: float) -> str:
 def _summary(docstring: str) -> str:
     """Return the first sentence of a table's docstring, without its heading."""
     text = " ".join(docstring.partition("\n\n")[0].split())
-    text = re.sub(r"^`\[.*?\]`: ", "", text).partition(". ")[0].rstrip(".")
+    text = text.rpartition("]`: ")[2].partition(". ")[0].rstrip(".")
     return text[:1].lower() + text[1:]
 
 
 def _findings(board: str, kinds: Mapping[str, FindingKind]) -> KeyTable:
-    """Return the events that a level reports itself as a table, though none is a key."""
+    """Return the events that a level declares, in the form of a table of keys."""
     keys = tuple(
         Key(kind.name, "number", kind.unit.removeprefix("1"), "", "", kind.doc)
         for kind in kinds.values()
@@ -246,20 +260,18 @@ def _findings(board: str, kinds: Mapping[str, FindingKind]) -> KeyTable:
 
 
 def _fault_kinds() -> Iterator[KeyTable]:
-    """Yield a table for every kind of fault with parameters: the keys of its `[[fault]]` besides
-    the common ones.
-    """
+    """Yield a table for each fault kind that has parameters, without the keys of all faults."""
     for kind in KINDS:
         keys = [
             Key(
-                name=each.name,
-                type="integer" if each.is_whole else "number",
-                unit="" if each.unit == "1" else each.unit,
-                permitted=f"{_number(each.least)} to {_number(each.most)}",
-                default=REQUIRED if each.default is None else _number(each.default),
-                meaning=each.meaning,
+                name=param.name,
+                type="integer" if param.is_whole else "number",
+                unit="" if param.unit == "1" else param.unit,
+                permitted=f"{_number(param.least)} to {_number(param.most)}",
+                default=REQUIRED if param.default is None else _number(param.default),
+                meaning=param.meaning,
             )
-            for each in kind.parameters
+            for param in kind.parameters
         ]
         if keys:
             heading = f'[[fault]] with kind = "{kind.name}"'

@@ -1,35 +1,31 @@
-"""From a config to a rack: `resolve` checks and wires everything, once.
+"""Resolution of a config: `resolve` checks it as a whole and wires its boards.
 
-`rack.boards.config.loader` reads the config before that, so that at launch the crate imports the
+`rack.boards.config.loader` reads the config first. At a launch the crate can therefore import the
 levels while this process resolves the config.
 """
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from resource import RLIMIT_MEMLOCK, RLIMIT_NOFILE, getrlimit
 from typing import Any, cast
 
 from rack.backplane.fault_table import Injection
 from rack.backplane.layout import Layout
 from rack.backplane.operator_table import Request
-from rack.backplane.process import DEADLINE, cores_kept_awake, mapped_and_locked
-from rack.backplane.segment import Segment
-from rack.backplane.words import Block, Demand
+from rack.backplane.words import Demand
 from rack.boards.config.cell import cell_sizes
 from rack.boards.config.commands import command_mistakes, requests
 from rack.boards.config.connections import TaskPorts, Wiring
 from rack.boards.config.injections import fault_mistakes, injections, places
-from rack.boards.config.layout import KEPT_S, LayoutMaker, exchanges, obtained_core, shared_out
+from rack.boards.config.layout import KEPT_S, LayoutMaker, exchanges, obtained_core
 from rack.boards.config.published import PublishedRack, publish
 from rack.boards.config.rules import broken_rules, network_rules
 from rack.boards.config.rules.levels import memory, neighbours, sizes
 from rack.boards.config.schema import LAN, CommandConfig, RackConfig
 from rack.boards.config.timing import is_critical, reservation
 from rack.boards.config.toml import table_of, without
-from rack.boards.errors import ConfigError, LaunchError, Mistake
+from rack.boards.errors import ConfigError, Mistake
 from rack.boards.faults.config import FaultConfig
 from rack.boards.faults.kind import KINDS
 from rack.boards.wiring import (
@@ -46,50 +42,56 @@ from rack.levels.tables import GoalConfig, RobotConfig
 LINGER_S = 0.5
 """Simulated time that a run continues after the task ends, to let the arm come to rest."""
 SILENT_S = 30.0
-"""Simulated time without a status after which the level that ends the run counts as dead; at least
-8 of its cycles."""
-AHEAD_S = KEPT_S / 2
-"""Simulated time by which lockstep may run ahead of a recorder: half of the time that the rings
-retain."""
-_PERMIT = (
-    "To allow it, add the line '@GROUP - {}' for one of your groups to /etc/security/limits.conf"
-    " and log in again (ulimit -{} shows the limit), or grant {}"
-)
-PERMIT = _PERMIT.format("rtprio 99", "r", "CAP_SYS_NICE")
-"""How a user obtains real-time priorities."""
-PERMIT_LOCK = _PERMIT.format("memlock unlimited", "l", "CAP_IPC_LOCK")
-FILES = 32
-"""Files that a process of a rack may have open, beside one for each other process and each mailbox
-that it writes."""
+"""Simulated time without a status after which the level that ends the run counts as dead.
 
+At least 8 cycles of that level.
+"""
+AHEAD_S = KEPT_S / 2
+"""Simulated time by which lockstep may run ahead of a recorder: half of what the rings retain."""
 LAYOUT_NEEDS = {"clock", "protocol", "robot", "scene", "task"}
-"""Tables without which there is no layout, and no level can judge its neighbours."""
+"""Tables that a layout depends on. If one has mistakes, no layout is computed."""
 
 
 def resolve(config: RackConfig) -> Resolved:
-    """Check and wire a config to run on this machine, now. Raises `ConfigError` with every
-    mistake.
+    """Check a config completely and wire it for a run on this machine.
+
+    Raises:
+        ConfigError: The config has mistakes. All of them are listed, including mistakes in the
+            certificate files of this machine.
     """
     network = network_rules(config)
-    further = () if network is None else network.credential_mistakes(config)
+    further = () if network is None else network.check_credentials(config)
     return _examined(config, further).resolved()
 
 
 def wire(config: RackConfig) -> Layout:
-    """Return the layout of a config, which may have run elsewhere. Raises `ConfigError` with every
-    mistake.
+    """Return the layout of a config, without a check of files that only its own machine has.
+
+    Raises:
+        ConfigError: The config has mistakes. All of them are listed.
     """
     return _examined(config).resolved().layout
 
 
 def classes(config: RackConfig) -> tuple[str, ...]:
-    """Return the classes of all levels, for the crate to preload while the config is checked."""
+    """Return the class names of all levels, which the crate preloads during the config check."""
     return tuple(dict.fromkeys(place.target for place in config.tasks()))
 
 
 @dataclass(frozen=True)
 class Resolved:
-    """A checked config with everything derived from it, ready to launch."""
+    """A checked config with everything that a launch derives from it.
+
+    Attributes:
+        config: The config.
+        layout: Layout of the segment.
+        tasks: Wiring of each task, in the order of the config.
+        hosts: Wiring of each host board.
+        faults: Entries of the fault table for the config's own faults.
+        commands: Requests for the config's own operator commands.
+        published: Facts about the levels, for tools.
+        goals: Final places of objects, by the row of each object in the scene.
+    """
 
     config: RackConfig
     layout: Layout
@@ -98,14 +100,16 @@ class Resolved:
     faults: tuple[Injection, ...]
     commands: tuple[Request, ...]
     published: PublishedRack
-    goals: Mapping[int, GoalConfig]  # where objects end, by their rows in the scene
+    goals: Mapping[int, GoalConfig]
 
     def for_run(self, repeats: str, entries: Mapping[str, Entries] | None) -> Resolved:
-        """Return the rack for one run.
+        """Return a copy for one run.
 
-        `repeats`: the name that its levels see, which may stand in their messages; empty: its own.
-        `entries`: of a replay, which has no host boards and other racks, but what each adapter
-        wrote in the recorded run.
+        Args:
+            repeats: Name of the rack that its levels see, because messages may contain it. Empty
+                for the rack's own name.
+            entries: For a replay, what each adapter wrote in the recorded run. A replay starts no
+                host boards and contacts no other racks. None for an ordinary run.
         """
         tasks = tuple(
             replace(
@@ -119,12 +123,14 @@ class Resolved:
 
     @property
     def is_replay(self) -> bool:
-        """Whether what came from outside in a recorded run comes again."""
+        """Whether adapters repeat the messages that entered a recorded run from outside."""
         return any(task.entries is not None for task in self.tasks)
 
     def clock(self, seconds: float | None) -> ClockWiring:
-        """Return the clock's wiring for a run of `seconds` of simulated time; None: until the task
-        ends.
+        """Return the wiring of the clock's board.
+
+        Args:
+            seconds: Simulated time after which the run stops, s. None to run until the task ends.
         """
         config = self.config
         clock = config.clock
@@ -135,11 +141,11 @@ class Resolved:
             silent = max(silent, 8 * self.layout.task(writer).every)
         executors = [task for task in self.layout.tasks if task.role == "executor"]
         core = obtained_core(clock.core)
-        # In lockstep the core of the fastest board, since a switch is faster than waking up a core.
-        # A polling board does not give its core away.
-        if config.is_lockstep and (giving := [task for task in executors if task.wake != "poll"]):
-            core = min(giving, key=lambda task: (task.every, task.slot)).core
-        # The demand on the arm while a board is lost; none if the level below holds.
+        # In lockstep the clock shares the core of the fastest board, because a context switch is
+        # faster than waking up another core. A polling board never yields its core.
+        if config.is_lockstep and (yielding := [t for t in executors if t.wake != "poll"]):
+            core = min(yielding, key=lambda task: (task.every, task.slot)).core
+        # Demand on the arm while a board is lost. None if the level below holds.
         demands = {"hold": Demand.NONE, "stop": Demand.STOP, "brake": Demand.BRAKE}
         return ClockWiring(
             lockstep=config.is_lockstep,
@@ -162,112 +168,39 @@ class Resolved:
 
     @property
     def ends_run(self) -> str | None:
-        """The status mailbox whose state ends the run; None: no level ends it."""
+        """Name of the status mailbox whose state ends the run. None if no level ends it."""
         return next(
             (f"{name}.status" for name, board in self.config.board.items() if board.ends_run), None
         )
 
     @property
     def crate_priority(self) -> int:
-        """SCHED_FIFO priority of the crate: below all real-time boards, above all ordinary
-        processes.
-        """
+        """SCHED_FIFO priority of the crate: below all real-time boards, above other processes."""
         priorities = [t.priority for t in self.layout.tasks if t.priority and t.role == "executor"]
         return max(min(priorities, default=0) - 1, 0)
 
-    def notes(self, segment: Segment) -> list[str]:
-        """Return notes for the launch to report: cores replaced, priorities refused, idle cores
-        held awake, ...
-        """
-        refused = self._refused(segment)
-        found = [*self.config.changed, *shared_out(self.config)]
-        if (network := network_rules(self.config)) is not None:
-            found += network.network_notes(self.config)
-        found += [f"{refused}; missed deadlines are likely. {PERMIT}"] if refused else []
-        found += self._reserved(segment)
-        found += self._unlocked(segment)
-        if self.clock(None).keeps_awake:
-            with cores_kept_awake() as refusal:
-                found.append(
-                    f'clock.idle_cores = "awake": {refusal or "idle cores are held awake"}'
-                )
-        if self.config.is_lockstep:
-            why = "sends enters at ticks that depend on its timing; --entries RUN repeats a run"
-            found += [f"what {host.board} {why}" for host in self.hosts if host.is_external]
-        return found
-
-    def check_realtime(self, segment: Segment) -> None:
-        """Raise `LaunchError` if a real-time priority was refused and the config requires it."""
-        if self.config.clock.on_no_realtime == "refuse" and (refused := self._refused(segment)):
-            raise LaunchError(f'{refused}, and clock.on_no_realtime is "refuse". {PERMIT}')
-
-    def check_files(self) -> None:
-        """Raise `LaunchError` if the system permits too few open files for this rack."""
-        needed = FILES + len(self.layout.processes) + len(self.layout.mailboxes)
-        if 0 <= (allowed := getrlimit(RLIMIT_NOFILE)[0]) < needed:
-            why = f"at most {allowed} open files are permitted (ulimit -n); the rack needs {needed}"
-            raise LaunchError(f"rack '{self.config.name}': {why}")
-
-    def _unlocked(self, segment: Segment) -> Iterator[str]:
-        """Yield which tasks have not locked their memory, and the limit."""
-        if self.config.is_lockstep:
-            return
-        unlocked = {}
-        for task in self.layout.tasks:
-            mapped, locked = mapped_and_locked(segment.block(task.name)[Block.PID])
-            if not locked:
-                unlocked[task.name] = mapped
-        if unlocked:
-            yield (
-                f"memory not locked for {', '.join(unlocked)}: the limit is"
-                f" {getrlimit(RLIMIT_MEMLOCK)[0]} bytes, a board maps {max(unlocked.values())};"
-                f" page faults may delay cycles. {PERMIT_LOCK}"
-            )
-
-    def _reserved(self, segment: Segment) -> Iterator[str]:
-        """Yield who has a reservation, on which cores, and who was refused one."""
-        asking = {
-            task.task: segment.block(task.task)
-            for task in self.tasks
-            if task.reservation is not None
-        }
-        given = [name for name, block in asking.items() if block[Block.PRIORITY] == DEADLINE]
-        pinned = [name for name in given if len(os.sched_getaffinity(asking[name][Block.PID])) == 1]
-        for what, names in (
-            ("earliest deadline first by SCHED_DEADLINE, on their cores", pinned),
-            ("earliest deadline first by SCHED_DEADLINE, on any core", set(given) - set(pinned)),
-            ("SCHED_DEADLINE refused, fixed priorities", asking.keys() - set(given)),
-        ):
-            if names:
-                yield f"{what}: {', '.join(sorted(names))}"
-
-    def _refused(self, segment: Segment) -> str:
-        if self.config.is_lockstep:
-            # It has no deadlines to miss.
-            return ""
-        refused = [
-            t.name
-            for t in self.layout.tasks
-            if t.priority and not segment.block(t.name)[Block.PRIORITY]
-        ]
-        return (
-            f"SCHED_FIFO refused, ordinary scheduling for {', '.join(refused)}" if refused else ""
-        )
-
 
 def _examined(config: RackConfig, further: Iterable[Mistake] = ()) -> Examination:
+    """Check a config. Raises `ConfigError` with its mistakes and the `further` ones, if any."""
     commands = [(f"command[{at}]", command) for at, command in enumerate(config.command)]
-    examined = Examination(config, places(config), commands)
-    if mistakes := [*examined.mistakes, *further]:
+    examination = Examination(config, places(config), commands)
+    if mistakes := [*examination.mistakes, *further]:
         raise ConfigError(mistakes)
-    return examined
+    return examination
 
 
 class Examination:
-    """A config with the findings of its check.
+    """Check of a whole config, and the records that it derives on the way.
 
-    `broken` names tables that were removed for mistakes already known; nothing that depends on them
-    is checked.
+    Args:
+        config: The config, without broken tables.
+        faults: Faults to check, with their places in the config.
+        commands: Operator commands to check, with their places in the config.
+        broken: Tables that were removed because of known mistakes, as in "board.servo". Nothing
+            that depends on them is checked.
+
+    Attributes:
+        mistakes: Every mistake found.
     """
 
     def __init__(
@@ -282,12 +215,13 @@ class Examination:
         self._sizes: dict[str, int] = {}
         self._layout: Layout | None = None
         self.mistakes = broken_rules(self._wiring)
-        unsound = broken.union(table_of(mistake.place) for mistake in self.mistakes)
-        wiring = self._wiring if not unsound else Wiring(_reduced(config, unsound), unsound)
-        if wiring.tasks and not unsound & LAYOUT_NEEDS:
+        # The checks that need a layout use only the boards without mistakes.
+        wrong = broken.union(table_of(mistake.place) for mistake in self.mistakes)
+        wiring = self._wiring if not wrong else Wiring(_reduced(config, wrong), wrong)
+        if wiring.tasks and not wrong & LAYOUT_NEEDS:
             self._sizes = cell_sizes(config)
-            self.mistakes += (wrong := [*sizes(wiring, self._sizes)])
-            if not wrong:
+            self.mistakes += (unknown_sizes := [*sizes(wiring, self._sizes)])
+            if not unknown_sizes:
                 self._layout = LayoutMaker(wiring, self._sizes).layout()
                 self._contexts = self._contexts_of_boards(wiring)
                 self.mistakes += memory(self._layout)
@@ -298,10 +232,10 @@ class Examination:
         broken_boards = self._wiring.broken_boards
         self.mistakes += command_mistakes(commands, config, levels, broken_boards)
         if (network := network_rules(config)) is not None:
-            self.mistakes = [network.at_adapter(mistake, config) for mistake in self.mistakes]
+            self.mistakes = [network.move_to_adapter(mistake, config) for mistake in self.mistakes]
 
     def resolved(self) -> Resolved:
-        """Return everything derived from a config without mistakes."""
+        """Return everything derived from the config, which must have no mistakes."""
         config = self._config
         layout = self._layout
         assert layout is not None, "no mistakes"
@@ -313,13 +247,15 @@ class Examination:
             self._task(layout, ports, ports.task in failing) for ports in self._wiring.tasks
         )
         hosts = tuple(self._host(ports) for ports in self._wiring.hosts)
-        # A goal that the config states replaces that of the program.
+        # A goal in the config replaces the program's goal for the same object.
         rows = config.scene.objects.index
         programs = [program.model_validate(config.task) for program in self._wiring.programs]
         goals = [goal for program in programs for goal in program.goals()]
-        at = {rows(goal.object): goal for goal in (*goals, *config.scene.goal)}
+        goal_by_row = {rows(goal.object): goal for goal in (*goals, *config.scene.goal)}
         commands = requests(config, layout)
-        return Resolved(config, layout, tasks, hosts, faults, commands, self._published, at)
+        return Resolved(
+            config, layout, tasks, hosts, faults, commands, self._published, goal_by_row
+        )
 
     def _host(self, ports: TaskPorts) -> HostWiring:
         config = self._config
@@ -338,7 +274,7 @@ class Examination:
         board = self._config.board[ports.place.board]
         spec = layout.task(ports.task)
         is_executor = spec.role == "executor"
-        # What is on the host side, a bus adapter exchanges by itself.
+        # A bus adapter exchanges the mailboxes of the host side itself.
         of_host = self._wiring.of_host
         from_host = self._wiring.from_host
         is_locked = not is_executor and is_critical(self._config, layout, spec.board)
@@ -358,7 +294,7 @@ class Examination:
             fails_self_test=fails_self_test,
             entries=None,
             exchange=exchanges(self._wiring, ports),
-            # Planners are below all reservations.
+            # Planners run below all reservations.
             reservation=reservation(
                 self._config, board.busy_ms if is_executor else 0.0, spec.every
             ),
@@ -382,7 +318,7 @@ class Examination:
                 below={other: paces[other] for other in board.below},
             )
             for name, board in boards.items()
-            # The neighbours of any other board have mistakes of their own.
+            # Omit boards whose neighbours are missing because of mistakes.
             if boards.keys() >= {*board.above, *board.below}
         }
 
@@ -392,7 +328,7 @@ class Examination:
             board=name,
             clock_ns=config.clock_ns,
             seed=config.seed,
-            # In a rack without an arm no level uses it.
+            # None without an arm; then no level uses it.
             robot=cast(RobotConfig, config.robot),
             scene=config.scene,
             task=config.task,
@@ -403,9 +339,9 @@ class Examination:
         )
 
 
-def _reduced(config: RackConfig, unsound: frozenset[str]) -> RackConfig:
+def _reduced(config: RackConfig, broken: frozenset[str]) -> RackConfig:
     """Return a config without the boards and host boards that have mistakes."""
-    kept = without({"board": config.board, "host": config.host}, unsound)
-    if "adapter" in unsound:
-        kept["board"].pop(LAN, None)
-    return config.model_copy(update=kept)
+    tables = without({"board": config.board, "host": config.host}, broken)
+    if "adapter" in broken:
+        tables["board"].pop(LAN, None)
+    return config.model_copy(update=tables)

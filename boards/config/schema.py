@@ -1,8 +1,8 @@
-"""The tables of a rack's config: every key with its unit, range and meaning.
+"""Tables of a rack's config: every key with its unit, range and meaning.
 
-`[robot]` and `[scene]` are declared in `rack.levels.robot` and `rack.levels.scene`; what `[task]`
-and `[board.<name>.params]` may hold is declared by the classes of the levels. In a description the
-unit follows a comma; `rack schema` shows it in a separate column.
+`rack.levels.tables` declares `[robot]` and `[scene]`. The classes of the levels declare the keys of
+`[task]` and `[board.<name>.params]`. The text below a field is its meaning, with the unit in
+brackets; `rack schema` shows the unit in a separate column.
 """
 
 from __future__ import annotations
@@ -38,8 +38,9 @@ CLOCK_SLOT = 1
 """Slot of the system controller, as on VME."""
 LAST_SLOT = 21
 OUTSIDE = 0
-"""Stands for the slot of a host board, which has none."""
+"""Value in place of a slot for host boards, which have none."""
 ANY_CORE = -1
+"""Value in place of a core for host boards, which are not pinned."""
 
 Coupling = Literal["tight", "loose", "none"]
 Mode = Literal["realtime", "lockstep"]
@@ -47,7 +48,7 @@ OnLoss = Literal["hold", "stop", "brake"]
 
 
 def _listed(value: Any) -> Any:
-    """Return a single name as a list of one, and TOML's list as a tuple."""
+    """Return a single name or a list of names as a tuple."""
     if isinstance(value, str):
         return (value,)
     return tuple(value) if isinstance(value, list) else value
@@ -65,172 +66,167 @@ Milliseconds = Annotated[float, Field(ge=0, le=1e7, allow_inf_nan=False)]
 SHORTEST_MS = 0.01
 """Shortest tick, in real time and in simulated time."""
 FORMAT = 2
-"""The newest format of configs: that of rack 0.2."""
+"""Newest format of configs, used since rack 0.2."""
 CHANGED = (
     'config format 1, from before rack 0.2: since then clock.idle_cores is "sleep" unless it is'
-    " given, and classes of levels have moved (old names still work); write format = 2 when that"
-    " suits you"
+    " given, and classes of levels have moved (old names still work); write format = 2 when"
+    " that suits you"
 )
 RESTART_S = 2.0
-"""Longest time of a restart in real time: a planner with its libraries takes 1.5 s."""
+"""Longest time of a restart in real time. A planner with its libraries needs 1.5 s."""
 LONGEST_EVERY = 1_000_000
 """Longest cycle of a board, ticks."""
 
 
 class ClockConfig(Table):
-    """`[clock]`: the system clock and its board, the system controller in slot 1."""
+    """`[clock]`: system clock and its board, the system controller in slot 1."""
 
     scheduler: Literal["fixed-priority", "earliest-deadline-first"] = "fixed-priority"
-    """fixed-priority: SCHED_FIFO, by the boards' priority; earliest-deadline-first: in real time
-    SCHED_DEADLINE, by their cycles, with twice their budgets reserved; on any core where the kernel
-    refuses theirs"""
+    """fixed-priority: SCHED_FIFO with the boards' priorities; earliest-deadline-first: in real time
+    SCHED_DEADLINE by the boards' cycles, with twice their budgets reserved; on any core if the
+    kernel refuses a board's own"""
     on_no_realtime: Literal["refuse", "warn"] = "warn"
-    """if a SCHED_FIFO priority is refused: warn and continue, or refuse to launch"""
+    """whether to warn or to refuse the launch if the system refuses a SCHED_FIFO priority"""
     period_ms: float = Field(ge=SHORTEST_MS, le=1000, allow_inf_nan=False)
-    """tick period, ms; a whole number of ns"""
+    """tick period [ms]; a whole number of ns"""
     mode: Mode = "realtime"
-    """realtime: ticks follow wall-clock time; lockstep: each tick comes once every task is done"""
+    """realtime: ticks follow wall-clock time; lockstep: a tick begins when every task is done"""
     speed: float = Field(1.0, ge=0.001, le=1000, allow_inf_nan=False)
     """simulated time divided by real time; 2 runs twice as fast"""
     wake: Wake = "timer"
-    """how boards wait for their next cycle: timer: each sleeps to its own grid point; signal: until
-    the clock wakes them; poll: busy-wait"""
+    """how boards wait for their next cycle: timer: each sleeps until its next release; signal: the
+    clock wakes them; poll: busy-wait"""
     idle_cores: Literal["sleep", "awake"] = "sleep"
-    """in real time, idle cores sleep or are held awake, which root alone may do; awake: wake-ups
-    are earlier by some 20 us on bare metal; a virtual machine may lose its cores for ms; see rack
-    bench machine"""
+    """whether idle cores sleep in real time; awake needs root and makes wake-ups about 20 us
+    earlier on bare metal, but a virtual machine may lose its cores for ms; see rack bench
+    machine"""
     core: Core = 0
     """core of the system controller"""
     priority: Priority = 0
-    """SCHED_FIFO priority of the system controller; 0: ordinary scheduling"""
+    """SCHED_FIFO priority of the system controller; 0 means ordinary scheduling"""
 
 
 class TimingConfig(Table):
     """`[timing]`: assumptions of the timing model about the processors."""
 
     context_switch_ms: Milliseconds = 0.1
-    """time of one context switch (t_cs), ms; the paper takes 0.1"""
+    """time of one context switch (t_cs) [ms]; the paper takes 0.1"""
     response_ms: float | None = Field(None, ge=SHORTEST_MS, le=1e9)
-    """goal for the response time R_s of the system (eqs 3.2, 3.3), ms; simulated time; R_max is R_s
-    / n"""
+    """goal for the response time R_s of the system (eqs 3.2, 3.3) [ms]; simulated time; R_max is
+    R_s / n"""
     clock_ms: Milliseconds = 0.0
-    """processor time of the system clock's board per tick, ms"""
+    """processor time that the system clock's board needs per tick [ms]"""
     small_share: float = Field(0.1, gt=0, le=1)
-    """largest fraction of a cycle that counts as much smaller than it (eq. 3.10)"""
+    """largest fraction of a cycle that counts as much smaller than the cycle (eq. 3.10)"""
 
 
 class ScheduleConfig(Table):
-    """`[schedule]`: a static cyclic schedule, in which every board has its place; see
-    `rack.boards.timing.frames`.
-    """
+    """`[schedule]`: static cyclic schedule of all boards; see `rack.boards.timing.frames`."""
 
     minor_ms: Positive
-    """minor frame, ms; a whole number of ticks, of which every board's cycle is a multiple"""
+    """minor frame [ms]; a whole number of ticks that divides every board's cycle"""
     major_ms: Positive
-    """major frame, ms; a multiple of the minor one, which every board's cycle divides"""
+    """major frame [ms]; a multiple of the minor frame and of every board's cycle"""
 
 
 class BudgetConfig(Table):
-    """`[board.<name>.budget]`: the level's worst-case processor times, for the timing model."""
+    """`[board.<name>.budget]`: worst-case processor times of the level, for the timing model."""
 
     read_ms: Milliseconds = 0.0
-    """R: read commands and statuses, per cycle, ms"""
+    """R: read commands and statuses, per cycle [ms]"""
     process_ms: Milliseconds = 0.0
-    """X: process, per cycle, ms"""
+    """X: process, per cycle [ms]"""
     write_ms: Milliseconds = 0.0
-    """W: write commands and statuses, per cycle, ms"""
+    """W: write commands and statuses, per cycle [ms]"""
     exchange_ms: Milliseconds = 0.0
-    """C: read the plan, per cycle, ms"""
+    """C: read the plan, per cycle [ms]"""
     plan_ms: Milliseconds = 0.0
-    """P: plan, per plan, ms"""
+    """P: plan, per plan [ms]"""
     update_ms: Milliseconds = 0.0
-    """U: write the plan, per plan, ms"""
+    """U: write the plan, per plan [ms]"""
     plan_within_ms: float | None = Field(None, gt=0, le=1e7)
-    """longest acceptable time for a new plan, ms; an upper limit on within_cycles"""
+    """longest acceptable time for a new plan [ms]; limits within_cycles"""
 
 
 class TransferConfig(Table):
-    """`[board.<name>.transfer]`: minimum processor times of bus accesses, to emulate a slower
-    bus.
-    """
+    """`[board.<name>.transfer]`: least processor times of bus accesses, to emulate a slower bus."""
 
     read_ms: Milliseconds = 0.0
-    """R: the executor reads commands and statuses, per cycle, ms"""
+    """R: the executor reads commands and statuses, per cycle [ms]"""
     write_ms: Milliseconds = 0.0
-    """W: the executor writes commands and statuses, per cycle, ms"""
+    """W: the executor writes commands and statuses, per cycle [ms]"""
     exchange_ms: Milliseconds = 0.0
-    """C: the executor reads the plan, per cycle, ms"""
+    """C: the executor reads the plan, per cycle [ms]"""
     update_ms: Milliseconds = 0.0
-    """U: the planner writes its plan, ms"""
+    """U: the planner writes its plan [ms]"""
 
 
 class ExchangeConfig(Table):
-    """`[board.<name>.exchange.<port>]`: when the executor reads one of its ports; default: in every
-    cycle.
-    """
+    """`[board.<name>.exchange.<port>]`: when the executor reads a port; default: every cycle."""
 
     every: int = Field(1, ge=1, le=LONGEST_EVERY)
-    """read in every n-th cycle; in between, the last message stays"""
+    """the port is read in every n-th cycle and keeps its message in between"""
     phase: int = Field(0, ge=0)
-    """number, less than every, of the first cycle that reads it, cycles"""
+    """number of the first cycle that reads the port, less than every [cycles]"""
     asynchronous: bool = False
-    """read the newest message as soon as it is written; in real time, runs then differ"""
+    """read the newest message as soon as it is written; real-time runs then differ"""
 
 
 class SupervisionConfig(Table):
-    """`[supervision]`: restarts of boards that die or hang, and the cycles that a level may lose.
+    """`[supervision]`: restarts of boards that die or hang, and cycles that a level may lose.
+
     When no restarts are left, the brakes stay engaged.
     """
 
     restarts: Restarts = 5
-    """maximum number of restarts of one task within within_s; 0: never restart"""
+    """maximum number of restarts of one task within within_s; with 0 it is never restarted"""
     within_s: Positive = 10.0
-    """time window in which restarts are counted, s; simulated time"""
+    """time window in which restarts are counted [s]; simulated time"""
     lockstep_restart_s: Positive = 0.5
-    """in lockstep, simulated time until a lost task returns, s; in real time it returns when
-    ready"""
+    """simulated time after which a lost task returns in lockstep [s]; in real time it returns when
+    it is ready"""
     max_missed_fraction: float = Field(0.05, ge=0, le=1)
-    """largest fraction of its cycles that a level may miss or skip in a run that succeeds, rounded
-    up to whole cycles; those due while an injected fault acts, or during the recovery from it, are
-    excused; 1: never judged"""
+    """largest fraction of its cycles that a level may miss or skip in a successful run, rounded up
+    to whole cycles; cycles due during an injected fault or the recovery from it do not count; 1: no
+    limit"""
 
     def restart_s(self, lockstep: bool) -> float:
-        """Return the longest simulated time that a restart may take."""
+        """Return the longest simulated time that a restart may take, s."""
         return self.lockstep_restart_s if lockstep else max(RESTART_S, self.lockstep_restart_s)
 
 
 class PlacedConfig(Table):
-    """Keys of a board in the crate, whether a level or the network adapter runs on it."""
+    """Keys that boards of levels and the board of the network adapter have in common."""
 
     slot: Slot
     """slot in the crate; slot 1 is the clock's"""
     core: Core = 0
-    """core of the board; if the machine lacks it, another core is used"""
+    """core of the board; another core is used if the machine does not have it"""
     priority: Priority = 0
-    """SCHED_FIFO priority of the executor; 0: ordinary scheduling"""
+    """SCHED_FIFO priority of the executor; 0 means ordinary scheduling"""
     budget: BudgetConfig | None = None
     """worst-case processor times, for the timing model"""
     restarts: Restarts | None = None
     """overrides supervision.restarts for this board's tasks"""
     restarts_within_s: Positive | None = None
-    """overrides supervision.within_s for this board's tasks, s"""
+    """overrides supervision.within_s for this board's tasks [s]"""
 
 
 class BoardConfig(PlacedConfig):
     """`[board.<name>]`: one processor of the rack, its level, and its wiring."""
 
     rate_hz: Positive | None = Field(None, ge=1e-6)
-    """rate of the executor, Hz; must divide the clock rate; give either rate_hz or every"""
+    """rate of the executor [Hz]; must divide the clock rate; give either rate_hz or every"""
     every: int | None = Field(None, ge=1, le=LONGEST_EVERY)
-    """instead of rate_hz: period of the executor, ticks"""
+    """period of the executor [ticks]; instead of rate_hz"""
     phase: int = Field(0, ge=0)
-    """first tick of the board, less than its period; its releases follow every period, ticks"""
+    """tick of the board's first release, less than its period [ticks]"""
     wake: Wake | None = None
     """how this board waits for its next cycle; default: clock.wake"""
     above: Neighbours = ()
-    """board of the level above, whose commands this level reads; or a list"""
+    """board of the level above, or a list; this level reads its commands"""
     below: Neighbours = ()
-    """board of the level below, whose status this level reads; or a list"""
+    """board of the level below, or a list; this level reads its status"""
     executor: ClassName
     """class of the executor, package.module:Class"""
     planner: ClassName | None = None
@@ -238,19 +234,19 @@ class BoardConfig(PlacedConfig):
     coupling: Coupling = "none"
     """tight: planner on this board; loose: on its own board; none: no planner"""
     within_cycles: int = Field(1, ge=1, le=10_000)
-    """time allowed for one plan, cycles"""
+    """time allowed for one plan [cycles]"""
     planner_slot: Slot | None = None
     """slot of a loosely coupled planner"""
     planner_core: Core | None = None
-    """core of a loosely coupled planner; default: the board's"""
+    """core of a loosely coupled planner; default: the board's core"""
     planner_priority: Priority = 0
-    """SCHED_FIFO priority of the planner; 0: ordinary scheduling"""
+    """SCHED_FIFO priority of the planner; 0 means ordinary scheduling"""
     reads: dict[str, Sources] = {}
-    """mailbox by port of the executor, or a list; overrides the level's own"""
+    """mailbox by port of the executor, or a list; overrides the sources that the level declares"""
     planner_reads: dict[str, Sources] = {}
-    """mailbox by port of the planner, likewise"""
+    """mailbox by port of the planner, or a list; as reads"""
     exchange: dict[str, ExchangeConfig] = {}
-    """when the executor reads a port, by port; also records the ages of all its messages"""
+    """when the executor reads a port, by port; the ages of all its messages are recorded"""
     params: dict[str, Any] = {}
     """parameters of the level, declared by its class"""
     transfer: TransferConfig = TransferConfig()
@@ -258,14 +254,16 @@ class BoardConfig(PlacedConfig):
     ends_run: bool = False
     """end the run when this level's status is done or error"""
     on_loss: OnLoss = "hold"
-    """while this board is lost: hold: the level below holds; stop: the arm ramps to rest, then
-    brakes; brake: the arm brakes at once"""
+    """reaction to the loss of this board; hold: the level below holds; stop: the arm ramps to rest,
+    then brakes; brake: the arm brakes at once"""
 
     @property
     def busy_ms(self) -> float:
-        """Processor time of a cycle of the executor by its budget, ms; 0: it has none."""
-        own = self.budget
-        return 0.0 if own is None else own.exchange_ms + own.read_ms + own.process_ms + own.write_ms
+        """Processor time of one executor cycle by the budget, ms. 0 without a budget."""
+        cost = self.budget
+        if cost is None:
+            return 0.0
+        return cost.exchange_ms + cost.read_ms + cost.process_ms + cost.write_ms
 
 
 LAN = "lan"
@@ -273,60 +271,62 @@ LAN = "lan"
 
 
 class LanConfig(PlacedConfig, LanTable):
-    """`[adapter.lan]`: the board that exchanges mailboxes with other racks: see
-    `rack.boards.lan.adapter`.
+    """`[adapter.lan]`: board that exchanges mailboxes with other racks.
+
+    See `rack.boards.lan.adapter`.
     """
 
     rate_hz: Positive = Field(50.0, ge=1e-6)
-    """rate of the board, Hz; must divide the clock rate"""
+    """rate of the board [Hz]; must divide the clock rate"""
 
     def board(self) -> BoardConfig:
-        """Return the board."""
-        own = {key: value for key, value in self if key not in LanTable.model_fields}
+        """Return the table of the board that this table adds to the rack."""
+        placement = {key: value for key, value in self if key not in LanTable.model_fields}
         params = self.model_dump(
             exclude_none=True, by_alias=True, include=set(LanTable.model_fields)
         )
-        # Without its adapter a rack does not know which others are there.
+        # Without its adapter a rack does not know which peers are present.
         on_loss: OnLoss = "stop" if self.on_peer_loss == "stop" else "hold"
-        return BoardConfig(executor=LAN_ADAPTER, params=params, on_loss=on_loss, **own)
+        return BoardConfig(executor=LAN_ADAPTER, params=params, on_loss=on_loss, **placement)
 
 
 class AdapterConfig(Table):
-    """`[adapter]`: ways out of the rack."""
+    """`[adapter]`: connections of the rack with the outside."""
 
     lan: LanConfig | None = None
     """exchange of mailboxes with other racks over a network"""
 
 
 class HostConfig(Table):
-    """`[host.<name>]`: one board of the host side, without slot, rate and priority: see
-    `rack.levels.host_program`.
+    """`[host.<name>]`: host board, which has no slot, rate or priority.
+
+    See `rack.levels.host_program`.
     """
 
     program: ClassName
     """class of the program, package.module:Class"""
     external: bool = False
-    """the rack does not start it: it is run by 'rack prompt'"""
+    """the rack does not start the program; `rack prompt` runs it"""
     below: Neighbours = ()
-    """bus adapter through which it reaches the levels; or a list"""
+    """bus adapter through which the program reaches the levels, or a list"""
     reads: dict[str, Sources] = {}
-    """mailbox by port; overrides the program's own"""
+    """mailbox by port; overrides the sources that the program declares"""
     params: dict[str, Any] = {}
     """parameters of the program, declared by its class"""
     computing_ms: float = Field(0.0, ge=0.0, le=1e9)
-    """in lockstep, simulated time from a wake-up until what it sends is passed on and it may be
-    woken again, ms; in real time its computing takes as long as it takes"""
+    """simulated time of one computation in lockstep [ms]: from a wake-up until the messages of the
+    program are passed on and it can be woken again; in real time it takes the actual time"""
     restarts: Restarts | None = None
     """overrides supervision.restarts for this board"""
     restarts_within_s: Positive | None = None
-    """overrides supervision.within_s for this board, s"""
+    """overrides supervision.within_s for this board [s]"""
 
 
 class CommandConfig(Table):
-    """`[[command]]`: one operator command to one level."""
+    """`[[command]]`: an operator command to a level."""
 
     level: str
-    """board whose level is commanded, as in servo or task"""
+    """board of the commanded level, such as servo or task"""
     what: Literal[
         "hold",
         "resume",
@@ -342,48 +342,55 @@ class CommandConfig(Table):
         "release",
     ]
     """hold: come to rest; resume: continue; setpoint, goto: move to a goal and stay there; modify:
-    put a control modification in or take it out; table: decide by another state table; do: do one
-    of the level's own commands; set: set a live parameter of the level; enable, disable: give
-    torque to the arm, or take it; reset: clear a fault of its drives; release: end
-    robot.bring_up"""
+    add or remove a control modification; table: switch to another state table; do: carry out one of
+    the level's own commands; set: change a live parameter of the level; enable, disable: turn the
+    torque of the arm on or off; reset: clear a fault of its drives; release: end robot.bring_up"""
     tick: Tick | None = None
     """tick at which the command is issued; give at most one of tick, at"""
     at: Moment | None = None
-    """instead of tick: simulated time, s"""
+    """simulated time at which the command is issued [s]; instead of tick"""
     joints: tuple[Finite, ...] | None = None
-    """goal: one position per joint, rad"""
+    """goal: one position per joint [rad]"""
     position: Vector | None = None
-    """goal: tool position, m; with quaternion or direction"""
+    """goal: tool position [m]; needs quaternion or direction"""
     quaternion: tuple[Finite, Finite, Finite, Finite] | None = None
     """goal: tool orientation as w, x, y, z"""
     direction: Vector | None = None
-    """goal: direction of the tool's z axis, rotation about it left free; default: down"""
+    """goal: direction of the tool's z axis, with any rotation about it; default: down"""
     home: bool = False
     """goal: the arm's start position"""
     name: Annotated[str, StringConstraints(max_length=NAME_BYTES)] | None = None
-    """control modification to put in or take out; name of a table; command to do, as in pick
-    block1; parameter to set, as in bandwidth=80"""
+    """name of a control modification or of a state table; command to carry out, as in pick block1;
+    parameter to set, as in bandwidth=80"""
     on: bool | None = None
-    """true: put it in; false: take it out"""
+    """whether to add (true) or to remove (false) the control modification"""
 
     @property
     def said(self) -> Operation:
-        """The operation commanded."""
+        """Operation that is commanded."""
         return Operation[self.what.upper()]
 
     @property
     def goals(self) -> list[Goal]:
-        """The goals given; valid are one or none, depending on the operation."""
-        found = [Goal.JOINTS] if self.joints is not None else []
+        """Forms of the goals that are given. A valid command has one or none, by its operation."""
+        goals = [Goal.JOINTS] if self.joints is not None else []
         if self.position is not None or self.quaternion is not None or self.direction is not None:
-            found.append(Goal.DIRECTION if self.quaternion is None else Goal.POSE)
-        found += [Goal.HOME] if self.home else []
-        return found if self.on is None else [*found, Goal.ON if self.on else Goal.OFF]
+            goals.append(Goal.DIRECTION if self.quaternion is None else Goal.POSE)
+        goals += [Goal.HOME] if self.home else []
+        return goals if self.on is None else [*goals, Goal.ON if self.on else Goal.OFF]
 
 
 class TaskPlace(NamedTuple):
-    """A task's place in the config: class, slot, requested core and SCHED_FIFO priority; that of a
-    host board.
+    """Entry of the config for a task or a host board.
+
+    Attributes:
+        name: Name of the task, as in "servo" or "servo.planner".
+        board: Name of its board.
+        role: "executor", "planner" or "host".
+        target: Its class, as "package.module:Class".
+        slot: Its slot.
+        core: The core that it requests.
+        priority: Its SCHED_FIFO priority. 0 for ordinary scheduling.
     """
 
     name: str
@@ -396,28 +403,28 @@ class TaskPlace(NamedTuple):
 
     @property
     def table(self) -> str:
-        """Its table, as in "board.servo"."""
+        """Table of the task, as in "board.servo"."""
         return f"{'host' if self.role == 'host' else 'board'}.{self.board}"
 
     @property
     def class_key(self) -> str:
-        """The key of its class."""
+        """Key of the table that names the class."""
         return "program" if self.role == "host" else self.role
 
     @property
     def reads_key(self) -> str:
-        """The key under which its ports are rewired."""
+        """Key of the table that connects ports to other mailboxes."""
         return "planner_reads" if self.role == "planner" else "reads"
 
 
 class RackConfig(Table):
-    """A rack: everything that a run depends on."""
+    """Config of a rack: everything that a run depends on."""
 
     format: int = Field(1, ge=1, le=FORMAT)
-    """2: as described here; 1, without this key: from before rack 0.2, whose changes a launch
-    tells"""
+    """format of this config; 2 is described on this page; 1 is from before rack 0.2, and a launch
+    notes the differences"""
     name: RackName
-    """name of the rack and of its shared memory: a-z, 0-9, - and _, at most 40"""
+    """name of the rack and of its shared memory: at most 40 of a-z, 0-9, - and _"""
     seed: int = Field(0, ge=0, le=2**31 - 1)
     """seed of all random numbers"""
     python_path: tuple[Annotated[Path, Field(strict=False)], ...] = ()
@@ -425,27 +432,27 @@ class RackConfig(Table):
     clock: ClockConfig
     """the system clock"""
     protocol: ProtocolConfig = ProtocolConfig()
-    """how mailboxes are shared"""
+    """protocols of the mailboxes"""
     timing: TimingConfig = TimingConfig()
     """assumptions of the timing model about the processors"""
     schedule: ScheduleConfig | None = None
-    """static cyclic schedule of all boards, if they have one"""
+    """static cyclic schedule of all boards"""
     robot: RobotConfig | None = None
     """the arm; required by levels that move one"""
     scene: SceneConfig = SceneConfig()
-    """the cell around the arm"""
+    """objects and obstacles around the arm"""
     task: dict[str, Any] = {}
     """program of the task level, declared by its class"""
     board: dict[str, BoardConfig] = Field(min_length=1)
     """boards by name; each runs the level of that name"""
     adapter: AdapterConfig = AdapterConfig()
-    """ways out of the rack: the network"""
+    """connections with the outside: the network"""
     host: dict[str, HostConfig] = {}
-    """boards of the host side by name, without real time"""
+    """host boards by name, which have no real-time guarantees"""
     supervision: SupervisionConfig = SupervisionConfig()
     """restarts of lost boards"""
     record: RecordConfig = RecordConfig()
-    """what is kept of a run"""
+    """how much of a run is recorded"""
     fault: tuple[FaultConfig, ...] = ()
     """faults injected into the run"""
     command: tuple[CommandConfig, ...] = ()
@@ -453,39 +460,41 @@ class RackConfig(Table):
 
     @model_validator(mode="after")
     def _with_adapters(self) -> Self:
-        """Add the adapter's board to the others."""
+        """Add the board of the network adapter."""
         if self.adapter.lan is not None and LAN not in self.board:
             self.board[LAN] = self.adapter.lan.board()
         return self
 
     @property
     def changed(self) -> list[str]:
-        """What has changed since the format of this config: a line, if it is not the newest."""
+        """Note on the changes since the format of this config. Empty for the newest format."""
         return [CHANGED] if self.format < FORMAT else []
 
     @property
     def is_lockstep(self) -> bool:
-        """Whether each tick comes once every task is done, instead of by wall-clock time."""
+        """Whether the clock runs in lockstep instead of real time."""
         return self.clock.mode == "lockstep"
 
     @property
     def clock_ns(self) -> int:
-        """One tick, in ns of simulated time."""
+        """Length of a tick in simulated time, ns."""
         return round(self.clock.period_ms * 1e6)
 
     @property
     def tick_ns(self) -> int:
-        """One tick, in ns of the wall clock."""
+        """Length of a tick in real time, ns."""
         return round(self.clock_ns / self.clock.speed)
 
     @property
     def joints(self) -> tuple[str, ...]:
-        """Names of the arm's joints; none in a rack without an arm."""
+        """Names of the arm's joints. Empty without an arm."""
         return () if self.robot is None else self.robot.joints
 
     def every(self, board: str) -> int:
-        """Return the period of a board's executor, ticks. Raises `ClockError` if it is off the
-        grid.
+        """Return the period of a board's executor, ticks.
+
+        Raises:
+            ClockError: The rate does not divide the clock rate.
         """
         config = self.board[board]
         if config.every is not None:
@@ -493,9 +502,7 @@ class RackConfig(Table):
         return ticks_of(config.rate_hz or 0.0, self.clock_ns, f"level '{board}'")
 
     def links(self) -> Iterator[tuple[str, str]]:
-        """Yield board above and board below of every two neighbours, whichever of them names the
-        other.
-        """
+        """Yield each pair of neighbours as upper and lower board. One of them names the other."""
         listed = [(name, lower) for name, board in self.board.items() for lower in board.below]
         listed += [(upper, name) for name, board in self.board.items() for upper in board.above]
         yield from (
@@ -505,12 +512,12 @@ class RackConfig(Table):
         )
 
     def all_below(self, board: str) -> set[str]:
-        """Return the boards below a board, directly or not."""
+        """Return all boards below a board, at any distance."""
         direct = {lower for upper, lower in self.links() if upper == board}
         return direct.union(*(self.all_below(lower) for lower in direct))
 
     def tasks(self) -> Iterator[TaskPlace]:
-        """Yield every task in order: each board's executor, then its planner."""
+        """Yield the tasks of all boards: of each board the executor, then the planner."""
         for name, board in self.board.items():
             yield TaskPlace(
                 name, name, "executor", board.executor, board.slot, board.core, board.priority
@@ -529,9 +536,7 @@ class RackConfig(Table):
                 )
 
     def hosts(self) -> Iterator[TaskPlace]:
-        """Yield every board of the host side, outside the crate: it has no slot, and runs on any
-        core.
-        """
+        """Yield the host boards. They have no slot and run on any core."""
         for name, host in self.host.items():
             yield TaskPlace(name, name, "host", host.program, OUTSIDE, ANY_CORE, 0)
 
@@ -540,24 +545,24 @@ class RackConfig(Table):
         return self.host[of.board] if of.role == "host" else self.board[of.board]
 
     def rewired(self, place: TaskPlace) -> Mapping[str, Sources]:
-        """Return the mailboxes that the config gives to ports of a task or host board, by port."""
-        found: Mapping[str, Sources] = getattr(self.table(place), place.reads_key)
-        return found
+        """Return the mailboxes to which the config connects ports of a task, by port."""
+        sources: Mapping[str, Sources] = getattr(self.table(place), place.reads_key)
+        return sources
 
     @property
     def outside(self) -> str:
-        """Whose state is not the rack's, so that it has no snapshots; empty: nobody's.
+        """State outside the rack that snapshots cannot contain, as text. Empty if there is none.
 
-        Such a rack repeats itself only with what came from outside of it then.
+        Such a rack repeats a run only if the recorded messages from outside enter it again.
         """
         hosts = ", ".join(map(repr, self.host))
-        found = [f"{hosts}: a host program's state"] if hosts else []
-        found += [f"'{LAN}': what comes from the network"] if self.adapter.lan is not None else []
-        return "; ".join(found)
+        states = [f"{hosts}: a host program's state"] if hosts else []
+        states += [f"'{LAN}': what comes from the network"] if self.adapter.lan is not None else []
+        return "; ".join(states)
 
     def text(self) -> str:
-        """Return the config as self-contained TOML that loads to the same config."""
-        # Not in JSON mode, which lacks infinity and NaN: parameters of levels may use them.
+        """Return the config as TOML text that loads to the same config without further files."""
+        # JSON mode cannot represent infinity and NaN, which parameters of levels may contain.
         tables = self.model_dump(exclude_none=True, by_alias=True)
         tables["python_path"] = [str(folder) for folder in self.python_path]
         if self.robot is not None:

@@ -1,4 +1,4 @@
-"""From a config to the timing model: budgets, and the model's input record."""
+"""Inputs of the timing model, from a config and its layout."""
 
 from __future__ import annotations
 
@@ -24,21 +24,28 @@ from rack.boards.timing.tasks import Budget, Part, TimedTask, Unit
 
 NS_PER_MS = 1e6
 RESERVED = 2
-"""Times its budget that a board may use up in a cycle: budgets are 99th percentiles, and the kernel
-lets whoever uses more wait for the next cycle."""
+"""Factor between a board's budget and the processor time that it reserves per cycle.
+
+A budget is a 99th percentile, and the kernel suspends a task that exceeds its reservation until its
+next cycle.
+"""
 KEYS = {part.name: part.name.replace("_ns", "_ms") for part in fields(Budget)}
-"""The key of a config's budget for each field of a `Budget`."""
+"""Key in a config for each field of a `Budget`."""
 PLANNER_BUDGET = ("exchange_ms", "plan_ms", "update_ms", "plan_within_ms")
-"""Keys of a budget that only a board with a planner has."""
+"""Keys of a budget that only a board with a planner may have."""
 
 
 def rack_timing(
-    config: RackConfig, layout: Layout, found: Mapping[str, Budget] | None = None
+    config: RackConfig, layout: Layout, measured: Mapping[str, Budget] | None = None
 ) -> RackTiming:
-    """Return the timing model's record of a rack, with the budgets `found`, by board; default: the
-    config's own.
+    """Build the timing model's record of a rack.
+
+    Args:
+        config: The config of the rack.
+        layout: Its layout.
+        measured: Budgets by board. None for the budgets in the config.
     """
-    found = budgets(config) if found is None else found
+    measured = budgets(config) if measured is None else measured
     goal_ms = config.timing.response_ms
     clock_cost_ns = round(config.timing.clock_ms * NS_PER_MS)
     parts = (Part(Unit.PROCESS, clock_cost_ns),) if clock_cost_ns else ()
@@ -51,7 +58,7 @@ def rack_timing(
         clock=TimedTask(
             CLOCK, CLOCK, "clock", config.clock.core, config.clock.priority, config.tick_ns, parts
         ),
-        boards={name: _board(config, layout, name, found.get(name)) for name in config.board},
+        boards={name: _board(config, layout, name, measured.get(name)) for name in config.board},
         context_switch_ns=round(config.timing.context_switch_ms * NS_PER_MS),
         small_share=config.timing.small_share,
         response_goal_ns=goal_ns,
@@ -61,13 +68,13 @@ def rack_timing(
 
 
 def frames(table: ScheduleConfig, clock_ns: int) -> CyclicSchedule:
-    """Return the frames, rounded to ticks."""
+    """Return the frames of a static schedule, rounded to ticks."""
     return CyclicSchedule(*(round(ms * 1e6 / clock_ns) for ms in (table.minor_ms, table.major_ms)))
 
 
 def inboxes(layout: Layout) -> dict[str, InboxTiming]:
-    """Return the inbox of every board that messages interrupt, by the task that serves it."""
-    found = {}
+    """Return the inbox of each board that messages interrupt, by the task that serves it."""
+    timings = {}
     for slot in dict.fromkeys(task.slot for task in layout.tasks):
         if boxes := layout.interrupting(slot):
             name = layout.handler(slot)
@@ -76,23 +83,24 @@ def inboxes(layout: Layout) -> dict[str, InboxTiming]:
                 InterruptSource(box.every * layout.clock_ns, how_sent(box).service_ns)
                 for box in boxes
             )
-            found[name] = InboxTiming(name, names, sources, how_sent(boxes[0]).depth)
-    return found
+            timings[name] = InboxTiming(name, names, sources, how_sent(boxes[0]).depth)
+    return timings
 
 
-def without_interrupts(timing: RackTiming, found: Mapping[str, Budget]) -> dict[str, Budget]:
-    """Return budgets measured in a run, by board, without what interrupts took; in lockstep they
-    take nothing.
+def without_interrupts(timing: RackTiming, measured: Mapping[str, Budget]) -> dict[str, Budget]:
+    """Return budgets measured in a run without the time that interrupts took.
+
+    In lockstep interrupts take no time.
     """
     if timing.is_lockstep:
-        return dict(found)
+        return dict(measured)
     return {
         name: replace(
             budget,
             read_ns=max(0, budget.read_ns - timing.interrupted_ns(name)),
             plan_ns=max(0, budget.plan_ns - timing.interrupted_ns(f"{name}.planner")),
         )
-        for name, budget in found.items()
+        for name, budget in measured.items()
     }
 
 
@@ -123,20 +131,29 @@ def _board(config: RackConfig, layout: Layout, name: str, budget: Budget | None)
 
 
 def _reads(layout: Layout, board: str) -> dict[str, TickGrid]:
-    """Return the ticks at which an executor reads the messages of others, by writer, if not in
-    every cycle.
+    """Return the ticks at which an executor reads messages, by their writer.
+
+    Writers whose messages it reads in every cycle are left out. If there are several ports, the one
+    that is read most rarely counts.
     """
-    found: dict[str, TickGrid] = {}
+    grids: dict[str, TickGrid] = {}
     for box in layout.mailboxes:
         for exchange in box.exchanges:
             if exchange.task == board:
-                found[box.writer] = max(found.get(box.writer, exchange.grid), exchange.grid)
-    return found
+                grids[box.writer] = max(grids.get(box.writer, exchange.grid), exchange.grid)
+    return grids
 
 
 def reservation(config: RackConfig, busy_ms: float, every: int) -> Reservation | None:
-    """Return what a board that computes so long in `every` ticks reserves of its processor, ms;
-    None: it asks for a priority.
+    """Return the processor time that a task reserves under earliest deadline first.
+
+    Args:
+        config: The config of the rack.
+        busy_ms: Processor time of one cycle by the budget, ms.
+        every: Period of the task, ticks.
+
+    Returns:
+        None if the task runs by its priority instead.
     """
     if config.clock.scheduler == "fixed-priority" or config.is_lockstep or not busy_ms:
         return None
@@ -145,15 +162,21 @@ def reservation(config: RackConfig, busy_ms: float, every: int) -> Reservation |
 
 
 def first_tick(entry: CommandConfig | FaultConfig, clock_ns: int) -> int:
-    """Return the tick from which a command or a fault is due; -1: at once."""
+    """Return the tick from which a command or a fault is due. -1 means at once."""
     if entry.at is not None:
         return round(entry.at * 1e9 / clock_ns)
     return -1 if entry.tick is None else entry.tick
 
 
 def is_critical(config: RackConfig, layout: Layout, board: str) -> bool:
-    """Say whether a board's plan update is the paper's critical section: tightly coupled, under
-    protocol lock.
+    """Return True if a board's plan update is the paper's critical section.
+
+    That is the case for a tightly coupled planner under protocol lock.
+
+    Args:
+        config: The config of the rack.
+        layout: Its layout.
+        board: Name of the board.
     """
     return (
         config.board[board].coupling == "tight"
@@ -162,7 +185,7 @@ def is_critical(config: RackConfig, layout: Layout, board: str) -> bool:
 
 
 def budgets(config: RackConfig) -> dict[str, Budget]:
-    """Return the config's budgets, by board; boards without one are omitted."""
+    """Return the budgets in a config, by board. Boards without one are left out."""
     return {
         name: Budget(
             **{part: round(getattr(board.budget, key) * NS_PER_MS) for part, key in KEYS.items()}
@@ -172,13 +195,13 @@ def budgets(config: RackConfig) -> dict[str, Budget]:
     }
 
 
-def with_budgets(config: RackConfig, found: Mapping[str, Budget]) -> RackConfig:
-    """Return the config with exactly these budgets, by board; each `plan_within_ms` is kept."""
+def with_budgets(config: RackConfig, measured: Mapping[str, Budget]) -> RackConfig:
+    """Return a config with exactly these budgets, by board. Each `plan_within_ms` is kept."""
     boards = {}
     for name, board in config.board.items():
         budget = None
-        if name in found:
-            times = {KEYS[part]: ns / NS_PER_MS for part, ns in asdict(found[name]).items()}
+        if name in measured:
+            times = {KEYS[part]: ns / NS_PER_MS for part, ns in asdict(measured[name]).items()}
             if board.planner is None:
                 times = {key: ms for key, ms in times.items() if key not in PLANNER_BUDGET}
             within_ms = None if board.budget is None else board.budget.plan_within_ms

@@ -1,4 +1,4 @@
-"""TOML text: parsed within limits, modified by `--set key.sub=value`, and written."""
+"""TOML text: parsing within limits, changes by `--set key.sub=value`, and writing."""
 
 from __future__ import annotations
 
@@ -14,16 +14,19 @@ from rack.backplane.bounded_toml import INTEGER_BITS, MAX_DEPTH, TOO_DEEP, TOO_L
 from rack.boards.errors import ConfigError, Mistake, shown
 
 SETTING = re.compile(r"""((?:"(?:[^"\\\n]|\\.)*"|'[^'\n]*'|[^"'=\n])+)=([^\0]*)""")
-""""key.sub=value", with a key of TOML: protocol.mailbox."level.plan"=lock."""
+"""A setting "key.sub=value". Its key is in TOML, as in `protocol.mailbox."level.plan"=lock`."""
 FREE_FORM = ("params", "task")
-"""Tables of the levels, where an empty list is an ordinary value."""
+"""Tables that levels declare. An empty list in them is a value and must be written."""
 
 Tables = dict[str, Any]
 
 
 def parse(text: str, place: str = "config") -> Tables:
-    """Return the tables of TOML text. Raises `ConfigError` with the invalid line, or every value
-    out of bounds.
+    """Parse TOML text.
+
+    Raises:
+        ConfigError: The text is not TOML, or contains values that no config may have, such as
+            dates, very long integers and very deep nesting. All such values are listed.
     """
     try:
         tables = load_toml(text)
@@ -31,14 +34,14 @@ def parse(text: str, place: str = "config") -> Tables:
         raise ConfigError([Mistake(place, None, f"not TOML: {error}")]) from None
     except ValueError as error:
         raise ConfigError([Mistake(place, None, str(error))]) from None
-    found = (_out_of_bounds(f"{place}: {key}", value, 1) for key, value in tables.items())
-    if mistakes := list(chain.from_iterable(found)):
+    checks = (_out_of_bounds(f"{place}: {key}", value, 1) for key, value in tables.items())
+    if mistakes := list(chain.from_iterable(checks)):
         raise ConfigError(mistakes)
     return tables
 
 
 def _out_of_bounds(where: str, value: Any, depth: int) -> Iterator[Mistake]:
-    """Yield mistakes that are valid TOML: deep nesting, long integers, NUL in text, dates."""
+    """Yield mistakes for values that TOML permits and configs do not, such as dates and NUL."""
     if isinstance(value, dict | list) and depth >= MAX_DEPTH:
         yield Mistake(where, None, TOO_DEEP)
     elif isinstance(value, dict):
@@ -57,13 +60,13 @@ def _out_of_bounds(where: str, value: Any, depth: int) -> Iterator[Mistake]:
 
 
 def to_toml(tables: Mapping[str, Any]) -> str:
-    """Return tables as TOML, without empty ones."""
+    """Return tables as TOML text. Empty tables and lists are left out."""
     return tomli_w.dumps(_without_empty(tables))
 
 
 def _without_empty(table: Mapping[str, Any]) -> Tables:
-    kept = {key: value for key, value in table.items() if value not in ({}, [], ())}
-    return {key: value if key in FREE_FORM else _lean(value) for key, value in kept.items()}
+    filled = {key: value for key, value in table.items() if value not in ({}, [], ())}
+    return {key: value if key in FREE_FORM else _lean(value) for key, value in filled.items()}
 
 
 def _lean(value: Any) -> Any:
@@ -73,7 +76,7 @@ def _lean(value: Any) -> Any:
 
 
 def merge(base: Tables, top: Tables) -> Tables:
-    """Return `base` updated with `top`, key by key."""
+    """Return `base` updated with `top`. Tables within them are merged key by key."""
     merged = dict(base)
     for key, value in top.items():
         is_table = isinstance(value, dict) and isinstance(base.get(key), dict)
@@ -82,15 +85,15 @@ def merge(base: Tables, top: Tables) -> Tables:
 
 
 def override(tables: Tables, settings: Sequence[str], mistakes: list[Mistake]) -> Tables:
-    """Return the tables with each setting `key.sub=value` applied, in order.
+    """Return tables with settings `key.sub=value` applied in order.
 
-    Values are TOML; any other text is taken as a string. A number in a key is an index into a list,
-    as in `task.action.0.by=30`.
+    Values are TOML. Text that is not TOML is taken as a string. A number in a key is an index into
+    a list, as in `task.action.0.by=30`.
 
     Args:
         tables: Tables of a config, which are not changed.
         settings: The settings.
-        mistakes: Gets every mistake; the settings without one are applied.
+        mistakes: List to which the mistakes are added. Settings without a mistake are applied.
     """
     for setting in settings:
         try:
@@ -104,11 +107,11 @@ def override(tables: Tables, settings: Sequence[str], mistakes: list[Mistake]) -
 
 
 def _parts(setting: str) -> tuple[list[str], str]:
-    """Return the keys and the value of a setting. Raises `LookupError`."""
-    found = SETTING.fullmatch(setting)
+    """Split a setting into keys and value text. Raises `LookupError` if it is not one."""
+    match = SETTING.fullmatch(setting)
     keys: list[str] = []
     try:
-        node: Any = load_toml(f"{found[1]} = 0") if found else 0
+        node: Any = load_toml(f"{match[1]} = 0") if match else 0
     except tomllib.TOMLDecodeError:
         node = 0
     except ValueError as error:
@@ -116,9 +119,9 @@ def _parts(setting: str) -> tuple[list[str], str]:
     while isinstance(node, dict):
         ((key, node),) = node.items()
         keys.append(key)
-    if found is None or not keys:
+    if match is None or not keys:
         raise LookupError("must be key=value, as in clock.speed=2")
-    return keys, found[2]
+    return keys, match[2]
 
 
 def _value(text: str) -> Any:
@@ -127,12 +130,13 @@ def _value(text: str) -> Any:
     except tomllib.TOMLDecodeError:
         return text.strip()
     except ValueError:
-        pass  # valid TOML, but out of bounds: `parse` gives the reason
+        # The text is TOML, but its value is out of bounds: `parse` reports why.
+        pass
     return parse(f"value = {text}")["value"]
 
 
 def _put(node: Any, keys: list[str], value: Any) -> Any:
-    """Return a copy of `node` with `value` at `keys`. Raises `LookupError` with a reason."""
+    """Return a copy of `node` with `value` set at `keys`. Raises `LookupError` for a wrong path."""
     if not keys:
         return merge(node, value) if isinstance(node, dict) and isinstance(value, dict) else value
     key, *rest = keys
@@ -149,15 +153,15 @@ def _put(node: Any, keys: list[str], value: Any) -> Any:
 
 
 def table_of(place: str) -> str:
-    """Return the table of a place, as "board.servo" of "board.servo.rate_hz = 3"."""
+    """Return the table that contains a place: "board.servo" for "board.servo.rate_hz = 3"."""
     kind, *name = re.split(r"[.\[=]", place.replace("mailbox ", "board."))[:2]
     return f"{kind}.{name[0]}" if name and kind in ("board", "host") else kind
 
 
 def without(tables: Tables, broken: frozenset[str]) -> Tables:
-    """Return tables without those with mistakes, as "robot" or "board.servo"."""
-    kept = {key: value for key, value in tables.items() if key not in broken}
+    """Return tables without the `broken` ones, which are named as in "robot" or "board.servo"."""
+    remaining = {key: value for key, value in tables.items() if key not in broken}
     for key in ("board", "host"):
-        own = kept.get(key, {})
-        kept[key] = {name: t for name, t in own.items() if f"{key}.{name}" not in broken}
-    return kept
+        named = remaining.get(key, {})
+        remaining[key] = {name: t for name, t in named.items() if f"{key}.{name}" not in broken}
+    return remaining

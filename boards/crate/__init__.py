@@ -1,1 +1,1 @@
-"""The Rack and its crate: boards launched, supervised, ended; or their levels, in one process."""
+"""Launch, supervision and end of boards: the Rack and its crate, or all levels in one process."""

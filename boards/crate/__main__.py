@@ -1,9 +1,9 @@
-"""The crate's process: see `rack.boards.crate.crate`."""
+"""Entry point of the crate's process: see `rack.boards.crate.crate`."""
 
 import gc
 
-# All that is imported and preloaded from here on stays: looking for garbage in it takes a tenth of
-# the launch.
+# Everything imported and preloaded from here on stays in memory. Looking for garbage in it would
+# take a tenth of the launch.
 gc.disable()
 
 from rack.boards.crate.crate import main  # noqa: E402

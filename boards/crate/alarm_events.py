@@ -1,6 +1,4 @@
-"""Alarms of tasks and clock as events: with names and units, as text for people and codes for
-programs.
-"""
+"""Conversion of alarms to events, with names and units as text and with codes for programs."""
 
 from __future__ import annotations
 
@@ -46,7 +44,7 @@ About = Literal[
     "nothing",
 ]
 ENGAGED_BY = ("the boards above", DEMANDED, NO_TORQUE, "")
-"""Why brakes engaged, where no error says it: by the subject of their alarm, from 0 down."""
+"""Reasons why brakes engaged that are not errors, by the negated subject of the alarm."""
 EMERGENCY_STOP = "emergency stop"
 ANOTHER_RACK = "another rack"
 DEMANDS: Mapping[Demand, str] = {
@@ -58,7 +56,7 @@ DEMANDED_BY: Mapping[str, str] = {
     EMERGENCY_STOP: "the emergency stop is latched",
     ANOTHER_RACK: "a rack that it works with is lost",
 }
-"""Why the arm must stop or brake, unless a board is lost."""
+"""Reasons why the arm must stop or brake, other than the loss of a board."""
 
 KIND_OF: Mapping[Alarm, EventKind] = {
     Alarm.FAULT_BEGINS: "fault",
@@ -79,7 +77,7 @@ KIND_OF: Mapping[Alarm, EventKind] = {
     Alarm.REMOTE_STOP: "command",
     **dict.fromkeys(MISSES, "miss"),
 }
-"""The kind of event for each alarm; any other alarm is a detection."""
+"""Kind of event for each alarm. All other alarms are detections."""
 TEXTS: Mapping[About, Mapping[Alarm, str]] = {
     "task": {
         Alarm.HANG: "'{subject}' is not responding: {releases} missed since tick {since}",
@@ -96,7 +94,7 @@ TEXTS: Mapping[About, Mapping[Alarm, str]] = {
         Alarm.HELD_BACK: "'{subject}': a message was delayed by {span}",
         Alarm.DISORDER: "'{subject}': messages out of order, the last one by {span}",
         Alarm.DAMAGED: "'{subject}': a message failed its check",
-        Alarm.BABBLE: "'{subject}': '{writer}' writes {value:g} messages per cycle; permitted: 1",
+        Alarm.BABBLE: "'{subject}': '{writer}' writes {value:g} messages per cycle instead of 1",
         Alarm.MASQUERADE: (
             "'{subject}': a message comes from process {value:.0f}, which is not its writer"
         ),
@@ -156,7 +154,7 @@ TEXTS: Mapping[About, Mapping[Alarm, str]] = {
 
 
 class RungAlarm(NamedTuple):
-    """An alarm: its code, its subject (see `Alarm`) and its event."""
+    """An alarm that was read from a ring: its code, its subject (see `Alarm`) and its event."""
 
     alarm: Alarm
     subject: int
@@ -164,7 +162,11 @@ class RungAlarm(NamedTuple):
 
 
 class AlarmWatch:
-    """Reads all alarm rings of a rack. `lost` counts alarms overwritten before they were read."""
+    """Reader of all alarm rings of a rack.
+
+    Attributes:
+        lost: Number of alarms that were overwritten before they were read.
+    """
 
     def __init__(self, segment: Segment) -> None:
         config = read_stored(segment.config)
@@ -172,15 +174,15 @@ class AlarmWatch:
             name: alarm_ring(segment, name)
             for name in (CLOCK, *(t.name for t in segment.layout.tasks))
         }
-        # The cell is built at the first collision.
+        # The cell is built only when the first collision is reported.
         geom = str if config.robot is None else partial(geom_name, config)
         levels = PublishedRack.of_rack(segment).levels
         self._events = AlarmEvents(segment, config.joints, geom, levels)
         self.lost = 0
 
     def drain(self) -> list[RungAlarm]:
-        """Return the alarms since the last call, by tick and time."""
-        found: list[RungAlarm] = []
+        """Return the alarms since the last call, in the order of ticks and times."""
+        alarms: list[RungAlarm] = []
         for owner, ring in self._rings.items():
             if not ring.waiting:
                 continue
@@ -188,15 +190,18 @@ class AlarmWatch:
             self.lost += lost
             for row in rows:
                 alarm = as_named(Alarm, row["code"])
-                found.append(RungAlarm(alarm, int(row["subject"]), self._events.of(row, owner)))
-        return sorted(found, key=lambda one: (one.event.tick, one.event.time_ns))
+                alarms.append(RungAlarm(alarm, int(row["subject"]), self._events.of(row, owner)))
+        return sorted(alarms, key=lambda rung: (rung.event.tick, rung.event.time_ns))
 
 
 class AlarmEvents:
-    """Turns a rack's alarms into events.
+    """Converter of a rack's alarms to events.
 
-    `joints` are the robot's; `geom` returns the name of a geom of the cell; `levels` are those that
-    the rack has published.
+    Args:
+        segment: Segment of the rack.
+        joints: Names of the robot's joints.
+        geom: Function that returns the name of a geom of the cell from its number.
+        levels: Levels that the rack has published.
     """
 
     def __init__(
@@ -212,14 +217,21 @@ class AlarmEvents:
         self._joints = joints
         self._geom = geom
         self._levels = levels
-        self._live: dict[tuple[str, str], object] = {}  # by board and key: params set since
+        # Values of live parameters that were set since the launch, by board and key.
+        self._live: dict[tuple[str, str], object] = {}
 
     def of(self, row: np.void, owner: str) -> Event:
-        """Return the event of an alarm: a row of `rack.backplane.watch.alarms.RECORD` from the ring
-        of task `owner`.
+        """Convert an alarm to an event.
 
-        The event's board is the one that raised the alarm; for a fault, restart or command, the one
-        affected.
+        The board of the event is the one that raised the alarm. For a fault, restart or command it
+        is the affected board.
+
+        Args:
+            row: A record of type `rack.backplane.watch.alarms.RECORD`.
+            owner: The task from whose ring the record was read.
+
+        Raises:
+            DamageError: The record refers to something that does not exist.
         """
         alarm = as_named(Alarm, row["code"])
         about, text = next((kind, texts[alarm]) for kind, texts in TEXTS.items() if alarm in texts)
@@ -262,8 +274,8 @@ class AlarmEvents:
             code = finding.name
             subject = board = owner
             measured = f"{value:.6g} {finding.unit}".removesuffix(" 1")
-            said = bytes(row["text"]).decode("utf-8", "replace") or finding.meaning
-            words["what"] = printable(f"{code}: {measured}, {said}")
+            detail = bytes(row["text"]).decode("utf-8", "replace") or finding.meaning
+            words["what"] = printable(f"{code}: {measured}, {detail}")
         else:
             subject = self._subject(about, number, owner)
             board = subject if alarm == Alarm.REJOINED else owner
@@ -286,7 +298,7 @@ class AlarmEvents:
         )
         tick = found_at = int(row["tick"])
         if alarm == Alarm.BRAKES_CLOSED and since < found_at:
-            # Brakes that engaged while no board drove the arm are known when one does again.
+            # Brakes that engage while no board drives the arm are reported once a board drives it.
             tick = since
             text += f", known at tick {found_at}"
         return Event(
@@ -303,7 +315,7 @@ class AlarmEvents:
         )
 
     def _subject(self, about: About, number: int, owner: str) -> str:
-        """Return the name of what an alarm of a task is about. Raises `DamageError`."""
+        """Return the name of the subject of an alarm. Raises `DamageError` if it does not exist."""
         match about:
             case "task":
                 return self._task(number, CLOCK)
@@ -324,10 +336,11 @@ class AlarmEvents:
                 return ""
 
     def _before(self, board: str, command: OperatorCommand) -> str:
-        """Return what a parameter was before a command that sets it."""
+        """Return the value of a parameter before a command that sets it, as a clause."""
         try:
             key, value = read_setting(command.name)
-        except LevelError:  # given past the checks of a config: the level refuses it
+        except LevelError:
+            # The command was not checked against the config, and the level refuses it.
             return ""
         param = self._levels[board].live.get(key)
         before = self._live.get((board, key), param and param.launched)
@@ -335,6 +348,7 @@ class AlarmEvents:
         return f", before {before}"
 
     def _task(self, number: int, other: str) -> str:
+        """Return the name of a task by its number, or `other` for a negative number."""
         return pick(self._layout.processes, number, "task").name if number >= 0 else other
 
     def _span(self, ticks: float) -> str:

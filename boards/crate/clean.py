@@ -1,4 +1,4 @@
-"""Removal of the remains of killed racks; a rack in use is never removed."""
+"""Removal of segments that killed racks have left. A rack in use is never removed."""
 
 from __future__ import annotations
 
@@ -14,16 +14,20 @@ from rack.backplane.words import Head
 
 
 def remove_dead(rack: str) -> bool:
-    """Remove the segment of a rack that is not running; return whether there was one.
+    """Remove the segment of a rack that is not running.
 
-    Raises `RackInUseError` if its launcher is alive, and `SegmentError` if the segment is another
-    user's or not a file.
+    Returns:
+        True if this call removed a segment.
+
+    Raises:
+        RackInUseError: The launcher of the rack is alive.
+        SegmentError: The segment belongs to another user or is not a file.
     """
     if rack not in racks():
         return False
     with suppress(FileNotFoundError):
-        # A file without room for a head is in no process's use: launches link whole segments to
-        # their names.
+        # A file too short for a head is not in use: a launch gives a segment its name only when it
+        # is complete.
         if stranger(rack) is None and shm_path(rack).stat().st_size < HEAD_SIZE:
             unlink(rack)
             return True
@@ -40,8 +44,8 @@ def remove_dead(rack: str) -> bool:
                 f"rack '{rack}' is already running, launched by {segment.launcher_text}; stop it,"
                 " or choose another name"
             )
-        # If two programs find the same dead rack, only one removes it. Otherwise the slower one
-        # would remove the rack that the faster one has meanwhile launched under the same name.
+        # If two programs find the same dead rack, only one may remove it. Otherwise the slower
+        # program would remove a rack that the faster one has launched under the same name.
         with closing(ByteLock(segment.fd, 8 * Head.MAGIC)) as removal:
             if not removal.take() or not segment.has_its_name:
                 return False
@@ -50,8 +54,11 @@ def remove_dead(rack: str) -> bool:
 
 
 def remove_own(rack: str | None = None, killed: Collection[int] = ()) -> None:
-    """Remove the racks launched by this process or by one that it has `killed`, or one of them, in
-    any state.
+    """Remove racks that this process has launched, whatever their state.
+
+    Args:
+        rack: Name of a rack. None for all of them.
+        killed: Processes that this one has killed. The racks that they launched are removed too.
     """
     for name in racks() if rack is None else [rack]:
         with suppress(SegmentError):
@@ -64,12 +71,14 @@ def remove_own(rack: str | None = None, killed: Collection[int] = ()) -> None:
 
 
 def clean() -> tuple[list[str], list[str], list[str]]:
-    """Remove every rack that is not running; return names removed, names in use, and a line per
-    foreign entry.
+    """Remove every rack that is not running.
+
+    Returns:
+        Names of the removed racks, names of racks in use, and an error for each other segment.
     """
     removed = []
     in_use = []
-    strange = []
+    foreign = []
     for rack in racks():
         try:
             if remove_dead(rack):
@@ -77,5 +86,5 @@ def clean() -> tuple[list[str], list[str], list[str]]:
         except RackInUseError:
             in_use.append(rack)
         except SegmentError as error:
-            strange.append(str(error))
-    return removed, in_use, strange
+            foreign.append(str(error))
+    return removed, in_use, foreign

@@ -1,11 +1,12 @@
-"""The crate: a small process that imports and preloads the boards' levels, then forks every board
-from itself.
+"""The crate: a process that imports the levels once and forks every board.
 
-Importing numpy, MuJoCo and the planning libraries takes half a second, and loading compiled code as
-long again; forked boards share the result, and with it one compiled cell. The crate stays
-single-threaded, so that forking is safe at any time. As the boards' parent it reaps them, and the
-kernel kills them if it ends. It is started as `python -m rack.boards.crate LINE ATTENTION`: the
-descriptors of the line and of the eventfd to which boards write.
+Importing numpy, MuJoCo and the planning libraries takes half a second, and loading compiled code
+takes another half. Forked boards share the result, including one compiled cell. The crate stays
+single-threaded, so that it can fork at any time. As the parent of the boards it reaps them, and the
+kernel kills them if it ends.
+
+It is started as `python -m rack.boards.crate LINE ATTENTION`. The arguments are the descriptors of
+the line to the Rack and of the eventfd to which boards write.
 """
 
 from __future__ import annotations
@@ -60,36 +61,42 @@ from rack.levels.errors import RobotError
 from rack.levels.level import Executor, Planner
 
 Source = Connection | socket | int
-"""What the crate waits for."""
+"""Object whose readiness the crate can wait for."""
 HOST_BOARD = "rack.boards.host.board"
-"""What runs a host board's program, by name: a rack without host boards does not load it."""
+"""Module that runs host programs. It is imported only in the processes of host boards."""
 HOST_PROCESSES = 4
-"""Processes beside those of the layout: Rack, crate, clock, recorder."""
+"""Processes that are not in the layout: Rack, crate, clock, recorder."""
 REST_S = 0.01
-"""Time between two reads of what host boards print: one that prints without end waits, and delays
-no other."""
+"""Time between two reads of a host board's output, so that endless output delays nothing else."""
 ORPHANS_S = 1.0
-"""Longest wait for the end of what a host board has started."""
+"""Longest wait for the end of processes that a host board has started."""
 LEAVE_S = 0.5
-"""Time for boards to end by themselves after the launcher has gone."""
+"""Time that boards have to end by themselves after the launcher has ended."""
 
 
 class Crate:
-    """The parent of all boards. Lives until the Rack closes the line."""
+    """Parent process of all boards. It lives until the Rack closes the line or ends.
+
+    Args:
+        line: Connection to the Rack.
+        attention: Descriptor of the eventfd to which boards write.
+    """
 
     def __init__(self, line: Connection, attention: int) -> None:
         self._line = line
         self._attention = attention
-        self._opened: Segment | None = None  # that of the Rack, from its request on
-        self._boards: dict[int, tuple[str, int]] = {}  # pidfd -> name, pid
+        # Segment of the present rack, from its `Open` request on.
+        self._opened: Segment | None = None
+        # Name and process id of each board, by pidfd.
+        self._boards: dict[int, tuple[str, int]] = {}
         self._shelf = SnapshotShelf()
         self._wirings: dict[str, TaskWiring | ClockWiring] = {}
         self._to_go_on: dict[str, WaitingCopy] = {}
         self._preloaded: set[str] = set()
         self._outputs: dict[str, HostOutput] = {}
         self._resting: list[HostOutput] = []
-        # The line alone does not show that the launcher is gone: a process that it forked may hold
-        # its end open.
+        # A closed line is not enough to detect the end of the launcher: a process that it forked
+        # may keep the other end open.
         self._launcher = os.pidfd_open(os.getppid())
 
     @property
@@ -98,7 +105,7 @@ class Crate:
         return self._opened
 
     def run(self) -> None:
-        """Serve the Rack until it is gone, then make sure that no board is left."""
+        """Serve requests until the Rack is gone, then make sure that no board is left."""
         while True:
             printing = [output for output in self._outputs.values() if output not in self._resting]
             readers = [output.reader for output in printing]
@@ -123,19 +130,20 @@ class Crate:
                 self._serve(request)
 
     def _serve(self, request: object) -> None:
+        """Carry out one request of the Rack."""
         match request:
-            case Preload() as wanted:
-                self._preload(wanted)
-            case Open() as wanted_rack:
-                self._open(wanted_rack)
+            case Preload() as preload:
+                self._preload(preload)
+            case Open() as opening:
+                self._open(opening)
             case PowerOn(name, TaskWiring() | ClockWiring() as wiring):
                 self._power_on(name, wiring)
             case PowerOn(name, HostWiring() as host):
-                # All processes of a host board print into one pipe.
+                # A restarted host board prints into the same pipe.
                 if name not in self._outputs:
                     self._outputs[name] = HostOutput(name)
                 lines = self._attention, self._outputs[name].writer
-                # Its process alone imports what that takes.
+                # Import the module in the forked process, so that the crate stays small.
                 self._fork(
                     name,
                     lambda segment: import_module(HOST_BOARD).run_host_board(segment, host, *lines),
@@ -146,7 +154,7 @@ class Crate:
                 self._kill(name)
             case Leave():
                 self._leave()
-                # A Rack that is gone is noticed next.
+                # If the Rack is gone, `run` notices it next.
                 with suppress(OSError):
                     self._line.send(Left())
             case Show(tick, name):
@@ -154,12 +162,12 @@ class Crate:
                 text = "" if snapshot is None or not name else snapshot.copies[name].show()
                 self._line.send(Shown(-1 if snapshot is None else snapshot.tick, text))
 
-    def _open(self, wanted: Open) -> None:
-        """Attach to a segment; fill it if its rack goes on from a snapshot."""
-        self._opened = segment = Segment.attach(wanted.rack)
+    def _open(self, opening: Open) -> None:
+        """Attach to a segment, and fill it if the rack continues from a snapshot."""
+        self._opened = segment = Segment.attach(opening.rack)
         note_used_files()
-        set_priority(wanted.priority)
-        snapshot = None if wanted.before is None else self._shelf.nearest(wanted.before)
+        set_priority(opening.priority)
+        snapshot = None if opening.before is None else self._shelf.nearest(opening.before)
         if snapshot is not None:
             fill_memory(segment, snapshot.memory, snapshot.tick)
             self._to_go_on = {**snapshot.copies}
@@ -167,7 +175,7 @@ class Crate:
         self._line.send(Opened(-1 if snapshot is None else snapshot.tick))
 
     def _power_on(self, name: str, wiring: TaskWiring | ClockWiring) -> None:
-        """Fork a task or the clock, or let its copy go on."""
+        """Fork a task or the clock, or let its copy in the snapshot continue."""
         self._wirings[name] = wiring
         copy = self._to_go_on.pop(name, None)
         if copy is not None and copy.can_be(wiring):
@@ -181,34 +189,33 @@ class Crate:
             self._fork(name, lambda segment: run_task_board(segment, wiring, *lines))
             return
         if copy is not None:
-            # As after the loss of a clock: it continues the run.
+            # As after the loss of a clock, the new clock continues the run.
             self._segment.words[System.STATE] = Run.RUNNING
         self._fork(name, lambda segment: run_clock_board(segment, wiring, *lines))
 
     def _take_note(self) -> None:
-        """Take the note of a board about its copy."""
+        """Receive a note of a board about its copy."""
         self._shelf.take_note(self._wirings)
         self._state_snapshots()
 
     def _state_snapshots(self) -> None:
-        """State on the backplane how many snapshots there are, and how large."""
+        """Write the number and size of the snapshots to the backplane."""
         words = self._segment.words
         words[System.SNAPSHOTS] = len(self._shelf)
         words[System.SNAPSHOT_BYTES] = self._shelf.private_bytes
 
-    def _preload(self, wanted: Preload) -> None:
-        """Load what boards share with the crate. Mistakes in the config are left for the Rack to
-        report.
-        """
-        sys.path[:] = wanted.path
+    def _preload(self, request: Preload) -> None:
+        """Import and preload what the boards share. The Rack reports mistakes of the config."""
+        sys.path[:] = request.path
         compiled.on_compile = lambda function: self._line.send(Compiling(function))
         load_machine_code()
-        for reference in wanted.classes:
+        for reference in request.classes:
             if reference in self._preloaded:
                 continue
             self._line.send(Preloading(reference))
             with suppress(LookupError):
-                # The launcher tries it, and outlives the crate.
+                # The launcher tries the import first, because it survives a module that ends its
+                # process.
                 kind = find_class(reference, object, is_tried=False)
                 try:
                     if issubclass(kind, Executor | Planner):
@@ -218,18 +225,18 @@ class Crate:
                     self._line.send(PreloadFailed(reference, reason))
                     return
                 self._preloaded.add(reference)
-        if wanted.cell is not None:
-            # Compile the cell, once for all boards. A cell with mistakes is the Rack's to
-            # report.
+        if request.cell is not None:
+            # Compile the cell once for all boards. The Rack reports mistakes in it.
             from rack.levels.robot.cell import build_cell
 
             with suppress(RobotError):
-                build_cell(wanted.cell.robot, wanted.cell.scene, wanted.cell.clock_ns)
+                build_cell(request.cell.robot, request.cell.scene, request.cell.clock_ns)
         compiled.on_compile = None
         gc.freeze()
         gc.enable()
 
     def _fork(self, name: str, board: Callable[[Segment], int]) -> None:
+        """Fork a process that runs `board` and exits with the status that it returns."""
         crate = os.getpid()
         try:
             pid = os.fork()
@@ -240,7 +247,7 @@ class Crate:
         if pid == 0:
             self._line.close()
             self._shelf.close_inherited()
-            # The only exit of the child: the crate's own code must not run twice.
+            # The child must exit here, so that the code of the crate does not run twice.
             status = os.EX_SOFTWARE
             try:
                 status = enter(crate, name, self._segment, board)
@@ -249,21 +256,23 @@ class Crate:
         self._watch(name, pid)
 
     def _fail_to_fork(self, name: str, why: str) -> None:
+        """Report a board that could not be forked as ended before it began."""
         end = Ended(name, 0, os.EX_OSERR, time.monotonic_ns(), self._mark_lost(name))
         with suppress(OSError):
             self._line.send(ForkFailed(end, f"board '{name}' cannot be forked: {why}"))
 
     def _watch(self, name: str, pid: int) -> None:
-        """Watch a process that has become a board."""
+        """Watch a new process of a board and report it to the Rack."""
         pidfd = os.pidfd_open(pid)
         self._boards[pidfd] = name, pid
-        # The Rack may have closed the line meanwhile: the crate must live to end its boards.
+        # The Rack may have closed the line. The crate must survive that to end its boards.
         with suppress(OSError):
             self._line.send(Forked(name, pid))
 
     def _end_orphans(self) -> None:
-        """End whatever a host board has started, in any session: with its end it has become a child
-        of the crate.
+        """Kill the processes that an ended host board has started, in whatever session.
+
+        Its end has made them children of the crate.
         """
         deadline = time.monotonic() + ORPHANS_S
         while time.monotonic() < deadline:
@@ -276,20 +285,22 @@ class Crate:
                 os.waitpid(pid, os.WNOHANG)
 
     def _mark_lost(self, name: str) -> int:
-        """Mark a board as lost on the backplane, for the clock and the other boards; return the
-        tick.
+        """Mark a board as lost on the backplane, for the clock and the other boards.
+
+        Returns:
+            The tick of the loss.
         """
         words = self._segment.words
         tick = words[System.TICK]
         if name in self._segment.map.blocks and words[System.STATE] != Run.STOPPED:
             block = self._segment.block(name)
-            # In lockstep it may have done part of a batch.
+            # In lockstep the board may have finished part of a batch of cycles.
             tick = max(tick, min(block[Block.DONE] + 1, block[Block.RELEASED]))
             if self._is_host(name) and block[Block.STATE] == TaskState.ENDED:
-                # Its program is done; a task ends with the run alone.
+                # The host program is finished. Tasks, in contrast, end only with the run.
                 block[Block.PID] = 0
                 return tick
-            # Odd while the loss is recorded: what the clock sees in between is not final.
+            # An odd number tells the clock that a loss is being recorded.
             words[System.LOSSES] += 1
             if block[Block.STATE] != TaskState.FAILED:
                 block[Block.STATE] = TaskState.ABSENT
@@ -297,7 +308,7 @@ class Crate:
             if not self._is_host(name):
                 UtilityLines(self._segment).assert_sysfail(self._segment.layout.task(name).slot)
             words[System.LOSSES] += 1
-            # In lockstep the clock waits for this.
+            # In lockstep the clock waits for the task's semaphore.
             done_semaphore(self._segment, name).release()
         return tick
 
@@ -305,25 +316,24 @@ class Crate:
         return any(host.name == name for host in self._segment.layout.hosts)
 
     def _kill(self, board: str | None = None) -> None:
+        """Kill a board, or all of them."""
         for pidfd, (name, _) in self._boards.items():
             if board in (None, name):
                 signal.pidfd_send_signal(pidfd, signal.SIGKILL)
 
     def _leave(self) -> None:
-        """Leave a rack whose Rack is gone, or wants that: boards notice it and end; those that take
-        too long are killed.
-        """
+        """Leave the present rack: let its boards end, and kill boards that take too long."""
         deadline = time.monotonic() + LEAVE_S
         for pidfd, (name, _) in self._boards.items():
             if self._is_host(name):
-                # It may block for ever: only a signal gets it out of that.
+                # A host program may block without a time limit, which only a signal interrupts.
                 signal.pidfd_send_signal(pidfd, signal.SIGTERM)
         while self._boards and (left := deadline - time.monotonic()) > 0:
             self._reap_ended(left)
         self._kill()
         while self._boards:
             self._reap_ended(None)
-        # What boards wrote of their copies before they ended.
+        # Receive the notes that boards wrote about their copies before they ended.
         while readable(self._shelf.line.fileno(), 0):
             self._take_note()
         self._reap_copies()
@@ -338,14 +348,20 @@ class Crate:
             self._opened = None
 
     def _reap_copies(self, are_all: bool = False) -> None:
-        """Reap the copies that have ended since; wait for their end if `are_all` to end."""
+        """Reap copies that have ended. If `are_all` is set, wait until all of them have."""
         with suppress(ChildProcessError):
             while os.waitpid(-1, 0 if are_all else os.WNOHANG)[0]:
                 continue
 
     def _reap_ended(self, timeout_s: float | None, *others: Source) -> Collection[object]:
-        """Reap boards that end, and take notes of others, until something happens; return what was
-        ready of these and of `others`.
+        """Wait for something to happen, reap boards that have ended, and receive notes on copies.
+
+        Args:
+            timeout_s: Longest time to wait, s. None to wait without a limit.
+            others: Further objects to wait for.
+
+        Returns:
+            The objects that are ready.
         """
         ready = wait([self._shelf.line, *self._boards, *others], timeout_s)
         for pidfd in [pidfd for pidfd in self._boards if pidfd in ready]:
@@ -365,8 +381,8 @@ class Crate:
 
 
 def main() -> None:
-    """Serve as the crate of the Rack at the other end of the inherited socket."""
-    # Ctrl-C reaches every process of the group, but the Rack decides how the run ends.
+    """Serve the Rack at the other end of the inherited socket."""
+    # Ctrl-C reaches every process of the group, but only the Rack decides how the run ends.
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     adopt_orphans()

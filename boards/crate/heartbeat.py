@@ -1,8 +1,6 @@
-"""The Rack's check for hanging processes: those that make no progress for much longer than their
-period.
+"""The Rack's check for processes that hang: no progress for much longer than their period.
 
-In real time it checks the clock alone, since the clock's watchdog checks the tasks. In lockstep it
-checks all.
+In real time it checks only the clock, whose watchdog checks the tasks. In lockstep it checks all.
 """
 
 from __future__ import annotations
@@ -15,16 +13,15 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Run, System
 
 HEARTBEATS_MISSED = 4
-"""Cycles without progress that count as hanging: three gave one false alarm in 24,000 at 400 Hz."""
+"""Ticks without progress after which the clock hangs. Three gave a false alarm in 24,000 ticks."""
 LEAST_S = 2.0
-"""Smallest bound: the launcher is an ordinary process among real-time ones and may itself be
-late."""
+"""Shortest time limit. The launcher has no real-time priority and may itself be late."""
 LOCKSTEP_S = 60.0
-"""Bound in lockstep, where time stands still during planning."""
+"""Time limit in lockstep, where simulated time stands still during planning."""
 
 
 class Heartbeat:
-    """Checks the clock and, in lockstep, the control blocks of all tasks."""
+    """Checks the progress of the clock and, in lockstep, of all tasks."""
 
     def __init__(self, segment: Segment) -> None:
         self._words = segment.words
@@ -40,23 +37,23 @@ class Heartbeat:
         self._waited_at = -1
 
     def hanging(self) -> list[str]:
-        """Return the tasks newly found hanging; "clock" is the system clock."""
+        """Return the tasks found hanging since the last call. The system clock is "clock"."""
         if self._words[System.STATE] != Run.RUNNING:
             return []
         now = time.monotonic()
         progress = {}
         for name, block in self._blocks.items():
             done = block[Block.DONE]
-            # An idle task, whose newest release is done, is alive; a lost one is already known. One
-            # may wait for as long as another rack wants.
+            # A task is excused if it is idle because its newest release is done, if its loss is
+            # already known, or if it waits for another rack, which may take any time.
             is_idle = done == block[Block.RELEASED] or block[Block.LOST] or block[Block.AWAITS]
             progress[name] = done, is_idle
         blocks = self._blocks.values()
         awaits = any(block[Block.AWAITS] for block in blocks)
-        # In lockstep several cycles may be one tick of the clock: it runs while they do.
+        # In lockstep a tick of the clock may contain several cycles, which count as its progress.
         ticks = self._words[System.TICK] + sum(block[Block.DONE] for block in blocks)
         progress[CLOCK] = ticks, self._words[System.HELD] or awaits
-        found = []
+        hanging = []
         for name, (count, is_excused) in progress.items():
             seen, since = self._seen[name]
             if count != seen or is_excused:
@@ -67,17 +64,15 @@ class Heartbeat:
                 and name not in self._reported
                 and (name != CLOCK or self._clock_is_stuck())
             ):
-                found.append(name)
-        self._reported.update(found)
-        return found
+                hanging.append(name)
+        self._reported.update(hanging)
+        return hanging
 
     def _clock_is_stuck(self) -> bool:
-        """Say whether a silent clock is stopped, dead or waiting; one that is runnable is merely
-        starved.
-        """
+        """Return True if a silent clock is stopped, dead or waiting, and not merely starved."""
         state = state_of(self._words[System.CLOCK_PID])
         tick = self._seen[CLOCK][0]
-        # Must be seen twice: after a pause of the whole machine the clock is about to be woken.
+        # A waiting clock must be seen twice: after a pause of the whole machine it is woken soon.
         waits = state in WAITING
         is_stuck = state in STOPPED + GONE or (waits and self._waited_at == tick)
         self._waited_at = tick if waits else -1

@@ -1,7 +1,7 @@
-"""Judges whether the tasks of a run kept up with the clock.
+"""Judgement on whether the tasks of a run kept up with the clock.
 
-Every release without a finished cycle is a skipped cycle, whatever the reason: the task was late,
-or its board dead, restarting, or not back before the end of the run.
+Every release without a finished cycle counts as a skipped cycle, whatever the reason: the task was
+late, or its board was dead, restarting, or not back before the end of the run.
 """
 
 from __future__ import annotations
@@ -20,19 +20,20 @@ from rack.boards.faults.kind import kind_of
 def judge_lost_cycles(
     segment: Segment, config: RackConfig, end: int
 ) -> tuple[list[str], list[str]]:
-    """Judge the cycles that each task lost, by missing or skipping them.
+    """Judge the cycles that each task missed or skipped.
 
-    Which cycles an injected fault cost is not known without a trace. Each task has the benefit of
-    the doubt: as many lost cycles as were due from a fault's first effect to the end of its
-    recovery, by the bound of its kind, are excused. The rest is compared with the other cycles.
+    Without a trace it is not known which cycles an injected fault cost. Every task is therefore
+    excused as many lost cycles as were due from a fault's first effect to the end of its recovery,
+    by the bound of its kind. The remaining lost cycles are compared with the remaining cycles.
 
     Args:
         segment: Memory of the rack, whose boards have finished their last cycles.
-        config: The rack; its `[supervision]` says how many may be lost.
+        config: Config of the rack. Its `[supervision]` says how many cycles may be lost.
         end: Length of the run, ticks.
 
     Returns:
-        A line for each task that lost too many cycles, and for each that only faults excuse.
+        A line for each task that lost too many cycles, and a line for each task that would have
+        lost too many without the excuse.
     """
     late = []
     excused = []
@@ -46,7 +47,7 @@ def judge_lost_cycles(
         disturbed = []
         for fault in faults:
             recovery = kind_of(fault).recovery_ticks(board_of(fault, layout), layout, restart_s)
-            # The cycle that is at work when the fault strikes may be lost, too.
+            # The cycle in progress when the fault strikes may also be lost.
             first = max(0, fault.struck_tick - task.slice + 1)
             disturbed.append((first, min(end, fault.until + recovery)))
         excusable = min(counts.due, _count_releases(task, disturbed))
@@ -65,7 +66,7 @@ def judge_lost_cycles(
 
 
 def _count_releases(task: TaskSpec, spans: Iterable[tuple[int, int]]) -> int:
-    """Return how many releases of a task lie in any of these spans of ticks, which may overlap."""
+    """Return the number of releases of a task within spans of ticks, which may overlap."""
     count = 0
     reached = 0
     for first, end in sorted(spans):
@@ -77,8 +78,15 @@ def _count_releases(task: TaskSpec, spans: Iterable[tuple[int, int]]) -> int:
 
 
 def _permit(due: int, fraction: float, plan: int) -> int:
-    """Return how many of the cycles due may be lost: the fraction, rounded up so that one late
-    cycle, or plan, does not fail a short run; but not all of them.
+    """Return how many of the due cycles may be lost.
+
+    The fraction is rounded up, so that one late cycle or plan does not fail a short run. Not all
+    cycles may be lost, however.
+
+    Args:
+        due: Number of cycles that were due.
+        fraction: Fraction of them that may be lost. 1 permits all.
+        plan: Number of cycles that one late plan costs.
     """
     most = plan * math.ceil(fraction * due / plan)
     return most if fraction == 1 else max(0, min(most, due - 1))

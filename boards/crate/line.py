@@ -1,9 +1,9 @@
-"""The line between the Rack and its crate: the Rack's end.
+"""The Rack's end of the line to its crate.
 
-The crate starts with this object and imports what boards need while its owner still reads the
-config, so this module imports next to nothing. The line is a `multiprocessing.connection` on a
-socket pair. Both ends are processes of this program, one started by the other. Nothing else can
-reach the sockets, so pickles are safe.
+Creating a `CrateLine` starts the crate, which imports what boards need while its owner still reads
+the config. This module therefore imports very little. The line is a `multiprocessing.connection` on
+a socket pair between two processes of this program. Nothing else can reach the sockets, so pickles
+are safe.
 """
 
 from __future__ import annotations
@@ -22,55 +22,62 @@ from rack.boards.crate.requests import Leave, Left, Show, Shown
 from rack.boards.errors import LaunchError
 
 SINGLE_THREADED = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-"""No threads in numerical libraries: the crate must have none when it forks, and a board has only
-its own core."""
+"""Settings that keep numerical libraries single-threaded.
+
+The crate must have no threads when it forks, and a board has only one core.
+"""
 TUNABLES = "GLIBC_TUNABLES"
 SAME_LIBM = "glibc.cpu.hwcaps=-FMA,-FMA4"
-"""The C library has two versions of `sin`, `exp` and others, with and without fused multiply-add.
-It selects one by processor, and they differ in the last bit. MuJoCo, OMPL, ruckig and Python's
-`math` call them. Boards use the version without, which runs on every processor. The choice is made
-at process start, so it must be in the environment."""
+"""Setting that makes the mathematical functions of the C library independent of the processor.
+
+The library has versions of `sin`, `exp` and others with and without fused multiply-add. It selects
+one by processor, and they differ in the last bit. MuJoCo, OMPL, ruckig and Python's `math` call
+them. Boards use the version without fused multiply-add, which runs on every processor. The library
+selects at the start of a process, so the setting must be in the environment.
+"""
 END_S = 1.0
-"""Time for a crate to end its snapshots and itself, before it is killed."""
+"""Time that a crate has to end its snapshots and itself before it is killed."""
 LEAVE_S = 10.0
-"""Longest time that a crate takes to leave a rack: it may still be importing."""
+"""Longest time that a crate takes to leave a rack. It may still be importing."""
 NO_WINDOWS = {"MUJOCO_GL": "disable"}
-"""Neither boards nor Rack draw: without this, importing MuJoCo also starts a process that looks for
-OpenGL."""
+"""Setting that stops MuJoCo from starting a process that looks for OpenGL, which nobody needs."""
 
 
 class CrateLine:
-    """A running crate: the line to it, the eventfd `attention` to which its boards write, and their
-    output.
+    """A running crate: connection, notifications and output of its boards.
 
-    A `Rack` closes the line that it is given. As a context it is closed, too, if no Rack came to
-    that.
+    A `Rack` closes the line that it is given. As a context, the line also closes if no Rack was
+    created.
+
+    Attributes:
+        line: Connection to the crate.
+        attention: Descriptor of the eventfd to which boards write.
     """
 
     def __init__(self) -> None:
-        self.line, theirs = Pipe()
+        self.line, crate_end = Pipe()
         self.attention = os.eventfd(0, os.EFD_NONBLOCK)
-        # A file in memory, so that printing boards never wait for a reader.
+        # Boards print into a file in memory, so that they never wait for a reader.
         self._printed = os.memfd_create("boards")
         self._read_to = 0
         self._process = subprocess.Popen(
-            # Unbuffered: a board ends by `os._exit`, which flushes no buffer.
+            # Output must not be buffered, because boards end by `os._exit`, which flushes nothing.
             [
                 sys.executable,
                 "-u",
                 "-P",
                 "-m",
                 "rack.boards.crate",
-                str(theirs.fileno()),
+                str(crate_end.fileno()),
                 str(self.attention),
             ],
-            pass_fds=(theirs.fileno(), self.attention),
+            pass_fds=(crate_end.fileno(), self.attention),
             stdin=subprocess.DEVNULL,
             stdout=self._printed,
             stderr=self._printed,
             env=environment(),
         )
-        theirs.close()
+        crate_end.close()
         self._is_closed = False
 
     def __enter__(self) -> Self:
@@ -85,31 +92,33 @@ class CrateLine:
         return self._process.pid
 
     def printed(self) -> list[str]:
-        """Return the lines printed by boards since the last call."""
+        """Return the lines that boards have printed since the last call."""
         data = os.pread(self._printed, 1 << 20, self._read_to)
-        whole = lines_of(data)
-        self._read_to += sum(map(len, whole))
-        return [line for part in whole for line in part.decode(errors="replace").splitlines()]
+        lines = lines_of(data)
+        self._read_to += sum(map(len, lines))
+        return [text for line in lines for text in line.decode(errors="replace").splitlines()]
 
     def send(self, request: object) -> None:
-        """Send a request to the crate. Raises `LaunchError`, with its output, if it is gone."""
+        """Send a request to the crate. If it is gone, raises `LaunchError` with its output."""
         try:
             self.line.send(request)
         except OSError:
             raise LaunchError("\n".join(self.printed()) or "the crate has ended") from None
 
     def ask(self, request: object) -> None:
-        """Send a request to the crate; if it is gone, `receive` will notice."""
+        """Send a request to the crate, or nothing if it is gone: `receive` will notice that."""
         with suppress(LaunchError):
             self.send(request)
 
     def receive(self) -> object:
-        """Return the crate's next message; None if the crate is gone."""
+        """Wait for the crate's next message and return it. None if the crate is gone."""
         return received(self.line)
 
     def close(self, timeout_s: float) -> None:
-        """Close the line, which makes the crate end its boards and itself; kill it after the
-        timeout.
+        """Close the line, so that the crate ends its boards and itself.
+
+        Args:
+            timeout_s: Time after which the crate is killed, s.
         """
         if self._is_closed:
             return
@@ -125,11 +134,12 @@ class CrateLine:
 
 
 class WarmCrate(CrateLine):
-    """A crate for several racks, one after the other: what it has imported and compiled stays.
+    """Crate for several racks in succession, which keeps what it has imported and compiled.
 
-    A Rack that closes it makes it leave the rack. Its owner ends it, or the context does.
-    `is_over`: it was ended, or did not leave a rack in time, and serves no more. It ends with its
-    present rack if that `is_last`.
+    When a Rack closes it, it only leaves that rack. Its owner ends it by `end` or as a context.
+
+    Attributes:
+        is_last: Whether it ends together with its present rack.
     """
 
     def __init__(self) -> None:
@@ -141,11 +151,11 @@ class WarmCrate(CrateLine):
 
     @property
     def is_over(self) -> bool:
-        """Whether it serves no more racks."""
+        """Whether the crate has ended, also because it did not leave a rack in time."""
         return self._is_closed
 
     def close(self, timeout_s: float) -> None:
-        """Have it end the boards of the rack, and wait until none is left."""
+        """Make the crate end the boards of its rack, and wait until none is left."""
         if self._is_closed:
             return
         if self.is_last:
@@ -164,8 +174,14 @@ class WarmCrate(CrateLine):
         self.end()
 
     def show(self, tick: int, task: str) -> Shown:
-        """Return the tick of the last snapshot at `tick` or before, -1 without one, and the
-        attributes of the level of a task there; none without a task.
+        """Read the attributes of a level from a snapshot.
+
+        Args:
+            tick: The last snapshot at or before this tick is used.
+            task: Task of the level. Empty to find only the tick of the snapshot.
+
+        Returns:
+            The tick of the snapshot, or -1 without one, and the attributes as JSON.
         """
         self.ask(Show(tick, task))
         answer: object = self
@@ -174,14 +190,12 @@ class WarmCrate(CrateLine):
         return answer or Shown(-1, "")
 
     def end(self) -> None:
-        """End the crate, and its snapshots."""
+        """End the crate and its snapshots."""
         super().close(END_S)
 
 
 def environment() -> dict[str, str]:
-    """Return the environment of the crate and its boards: the Rack's own, with settings that make
-    runs repeatable.
-    """
+    """Return the environment of the crate: this process's, with settings for repeatable runs."""
     tunables = ":".join(filter(None, (os.environ.get(TUNABLES), SAME_LIBM)))
     return {
         **os.environ,
@@ -193,7 +207,7 @@ def environment() -> dict[str, str]:
 
 
 def received(line: Connection) -> object:
-    """Return the next message on a line; None if the other end is gone."""
+    """Wait for the next message on a line and return it. None if the other end is gone."""
     try:
         return line.recv()
     except (EOFError, OSError):

@@ -1,7 +1,7 @@
-"""Other racks on this machine, and the cores occupied by their real-time boards.
+"""Other racks on this machine, and the cores that their real-time boards occupy.
 
 Two real-time boards on one core starve each other, and each rack sees only its own lateness. Racks
-in lockstep and tasks at ordinary priority occupy no core: they can wait.
+in lockstep and tasks with ordinary priority do not occupy a core, because they can wait.
 """
 
 from __future__ import annotations
@@ -24,8 +24,12 @@ from rack.boards.config.schema import RackConfig
 
 @dataclass(frozen=True)
 class Holder:
-    """A rack that occupies a core, and its tasks there. Of another user's rack, `process` is one of
-    the boards, otherwise the launcher.
+    """A rack that occupies a core.
+
+    Attributes:
+        rack: Name of the rack.
+        process: Its launcher. For another user's rack, one of its boards.
+        tasks: Its tasks on the core.
     """
 
     rack: str
@@ -33,68 +37,76 @@ class Holder:
     tasks: tuple[str, ...]
 
     def __str__(self) -> str:
-        """Return the holder as text."""
+        """Return the holder as a clause for messages."""
         return (
             f"rack '{self.rack}' ({self.process}) runs {', '.join(self.tasks)} on it at"
             " real-time priority"
         )
 
 
-def holders(own: str) -> dict[int, Holder]:
-    """Return the holder of each core, ignoring the rack `own`."""
-    found: dict[int, Holder] = {}
+def holders(ignored: str) -> dict[int, Holder]:
+    """Return the rack that occupies each core. The rack named `ignored` does not count."""
+    occupied: dict[int, Holder] = {}
     for name in racks():
-        if name == own:
+        if name == ignored:
             continue
         try:
             segment = Segment.attach(name)
         except SegmentError:
-            # Another user's, or of another version: its processes still show what it occupies.
-            found = {**_seen(name), **found}
+            # A rack of another user or version cannot be read, but its processes show its cores.
+            occupied = {**_seen(name), **occupied}
             continue
         if segment.launcher_is_alive and not segment.words[System.LOCKSTEP]:
             for core, tasks in _held(segment).items():
-                found.setdefault(core, Holder(name, segment.launcher_text, tuple(tasks)))
+                occupied.setdefault(core, Holder(name, segment.launcher_text, tuple(tasks)))
         segment.close()
-    return found
+    return occupied
 
 
 def _seen(rack: str) -> dict[int, Holder]:
-    held: dict[int, Holder] = {}
+    """Find the cores that a rack occupies from the names and priorities of processes."""
+    occupied: dict[int, Holder] = {}
     for folder in Path("/proc").glob("[0-9]*"):
         pid = int(folder.name)
-        with suppress(OSError):  # it has ended meanwhile
-            # The kernel keeps 15 characters: see `process.name_process`.
+        # The process may have ended.
+        with suppress(OSError):
+            # The kernel keeps 15 characters of a name: see `process.name_process`.
             name = (folder / "comm").read_text().strip()
             policy = os.sched_getscheduler(pid) & ~os.SCHED_RESET_ON_FORK
             if name.startswith(f"{rack}:"[:15]) and policy in (os.SCHED_FIFO, SCHED_DEADLINE):
                 for core in os.sched_getaffinity(pid):
-                    others = held[core].tasks if core in held else ()
-                    held[core] = Holder(
+                    others = occupied[core].tasks if core in occupied else ()
+                    occupied[core] = Holder(
                         rack, f"process {pid}", (*others, name.removeprefix(f"{rack}:"))
                     )
-    return held
+    return occupied
 
 
 def _held(segment: Segment) -> dict[int, list[str]]:
+    """Return the real-time tasks of a running rack by core, from its segment."""
     if segment.words[System.STATE] == Run.STOPPED:
         return {}
-    held: dict[int, list[str]] = {}
+    occupied: dict[int, list[str]] = {}
     for task in segment.layout.tasks:
         if segment.block(task.name)[Block.PRIORITY]:
-            held.setdefault(task.core, []).append(task.name)
-    # Another version of this program may have created the segment, so its config is not validated
-    # here.
+            occupied.setdefault(task.core, []).append(task.name)
+    # The config is not validated: another version of this program may have created the segment.
     clock = load_toml(segment.config).get("clock", {})
     # If the boards were refused their priority, so was the clock.
-    if held and clock.get("priority"):
-        held.setdefault(obtained_core(clock["core"]), []).append(CLOCK)
-    return held
+    if occupied and clock.get("priority"):
+        occupied.setdefault(obtained_core(clock["core"]), []).append(CLOCK)
+    return occupied
 
 
 def placed(config: RackConfig, held: Mapping[int, Holder]) -> tuple[RackConfig, list[str]]:
-    """Return the config with boards moved off occupied cores, unless it names their core, and a
-    note on each move.
+    """Move boards from occupied cores to a free one, unless the config gives their core.
+
+    Args:
+        config: The config.
+        held: The rack that occupies each core.
+
+    Returns:
+        The changed config and a note on each move.
     """
     free = [core for core in sorted(os.sched_getaffinity(0)) if core not in held]
     if not free or config.clock.mode == "lockstep":
@@ -115,16 +127,16 @@ def placed(config: RackConfig, held: Mapping[int, Holder]) -> tuple[RackConfig, 
 
 
 def conflicts(config: RackConfig, held: Mapping[int, Holder]) -> list[str]:
-    """Return a line for every core that another rack occupies and a real-time task of this config
-    requests.
-    """
+    """Return a line for each core that real-time tasks of this config share with another rack."""
     tasks = [
         (CLOCK, config.clock.core, config.clock.priority),
         *((t.name, t.core, t.priority) for t in config.tasks()),
     ]
-    wanted: dict[int, list[str]] = {}
+    requested: dict[int, list[str]] = {}
     for task, core, priority in tasks:
         if priority:
-            wanted.setdefault(obtained_core(core), []).append(task)
-    both = sorted(wanted.keys() & held.keys()) if config.clock.mode == "realtime" else []
-    return [f"core {core}, requested by {', '.join(wanted[core])}: {held[core]}" for core in both]
+            requested.setdefault(obtained_core(core), []).append(task)
+    both = sorted(requested.keys() & held.keys()) if config.clock.mode == "realtime" else []
+    return [
+        f"core {core}, requested by {', '.join(requested[core])}: {held[core]}" for core in both
+    ]

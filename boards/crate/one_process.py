@@ -1,6 +1,6 @@
-"""The levels of a rack in one process: the same `process` and `plan` calls, one after another.
+"""All levels of a rack in one process, which calls `process` and `plan` of each in turn.
 
-For the test of a level of one's own, and to see what a rack's work is without the rack:
+Use it to test your own level, or to measure the work of the levels without the rack:
 
     from rack.boards import OneProcess
 
@@ -8,9 +8,9 @@ For the test of a level of one's own, and to see what a rack's work is without t
         rack.run(2.0)
         assert rack.newest("power.status").energy > 0.0
 
-Levels, ports and delays are those of the resolved config; a message becomes visible by ticks alone,
-as under protocol time-slice, so every level reads what it reads in a rack in lockstep, and does the
-same. No clock, no shared memory, no checks and no trace; nobody commands it, and no fault strikes.
+Levels, ports and delays are those of the resolved config. As under protocol time-slice, the tick
+alone determines when a message becomes visible. Every level therefore reads and does the same as in
+a rack in lockstep. There is no clock, shared memory, check or trace, and no commands or faults.
 """
 
 from __future__ import annotations
@@ -32,12 +32,15 @@ from rack.levels.level import Executor, Planner, Reading, Verdict
 
 
 class OneProcess:
-    """A rack in one process, in a context: leaving it closes its levels. `tick` is the tick that is
-    due next.
+    """Levels of a rack in one process. Leaving the context closes them.
 
-    Raises `ConfigError` for an invalid config; `LaunchError` for a host board, and for a mailbox
-    whose messages depend on boards: a queue, whose writer depends on its reader, an exchange, an
-    interrupt.
+    Attributes:
+        tick: The next tick.
+
+    Raises:
+        ConfigError: The config has mistakes. All of them are listed.
+        LaunchError: The rack has host boards, queues, exchanges or interrupts, which need
+            processes.
     """
 
     def __init__(self, config: RackConfig) -> None:
@@ -51,7 +54,7 @@ class OneProcess:
             raise LaunchError(f"{', '.join(boards)}: {why}")
         if plan.hosts:
             names = ", ".join(host.board for host in plan.hosts)
-            raise LaunchError(f"{names}: a host board, which is a process of its own")
+            raise LaunchError(f"{names}: a host board, which needs a separate process")
         self.tick = 0
         self._clock_ns = plan.layout.clock_ns
         self._posts = {spec.name: Post(spec) for spec in plan.layout.mailboxes}
@@ -60,7 +63,7 @@ class OneProcess:
 
     @classmethod
     def from_file(cls, config: str | Path, overrides: Sequence[str] = ()) -> Self:
-        """Return the rack of a config, by name or path, with overrides as in `load`."""
+        """Return the levels of a config, given by name or path, with settings as in `load`."""
         return cls(load(config, overrides))
 
     def __enter__(self) -> Self:
@@ -76,17 +79,17 @@ class OneProcess:
         self.close()
 
     def close(self) -> None:
-        """Close the levels."""
+        """Close all levels."""
         for task in self._tasks:
             task.level.close()
 
     def run(self, seconds: float) -> None:
-        """Run for simulated `seconds`; raises what a level raises."""
+        """Run for `seconds` of simulated time. Exceptions of levels are passed on."""
         self.run_ticks(round(seconds * 1e9 / self._clock_ns))
 
     def run_ticks(self, ticks: int) -> None:
-        """Run for so many ticks."""
-        # Collect no garbage meanwhile, as in a board.
+        """Run for a number of ticks. Exceptions of levels are passed on."""
+        # As in a board, garbage is not collected during cycles.
         gc.collect()
         gc.freeze()
         gc.disable()
@@ -101,12 +104,14 @@ class OneProcess:
             gc.unfreeze()
 
     def newest(self, mailbox: str) -> AnyMessage:
-        """Return a copy of the newest message that was visible in the last tick. Raises
-        `LookupError`: there was none, or no such mailbox.
+        """Return a copy of the newest message that was visible in the last tick.
+
+        Raises:
+            LookupError: The mailbox does not exist, or no message was visible.
         """
         post = self._posts.get(mailbox)
         if post is None:
-            raise LookupError(f"no mailbox '{mailbox}'; there are: {', '.join(self._posts)}")
+            raise LookupError(f"no mailbox '{mailbox}'; mailboxes: {', '.join(self._posts)}")
         newest = post.newest(self.tick - 1)
         if newest is None:
             raise LookupError(f"'{mailbox}' is empty at tick {self.tick - 1}")
@@ -116,14 +121,21 @@ class OneProcess:
 
     @property
     def serials(self) -> Mapping[str, int]:
-        """The number of the newest message of each mailbox that has one, as in `newest`."""
+        """Serial of the newest visible message of each mailbox that has one."""
         newest = {name: post.newest(self.tick - 1) for name, post in self._posts.items()}
-        return {name: found[0] for name, found in newest.items() if found is not None}
+        return {name: entry[0] for name, entry in newest.items() if entry is not None}
 
 
 class Post:
-    """One mailbox: `message` to fill, and the messages written so far that a reader may still
-    need.
+    """Mailbox in private memory.
+
+    Attributes:
+        spec: Its record in the layout.
+        dtype: numpy type of its messages.
+        message: Message that the writer fills.
+        serial: Serial of the last written message.
+        kept: Written messages that are not visible yet, and the newest visible one. Each has the
+            tick at which it becomes visible, its serial and its bytes.
     """
 
     def __init__(self, spec: MailboxSpec) -> None:
@@ -131,19 +143,21 @@ class Post:
         self.dtype = message_dtype(spec.fields, spec.size)
         self.message = AnyMessage(self.dtype)
         self.serial = 0
-        # All that are not visible yet, and the newest that is.
         self.kept: deque[tuple[int, int, bytes]] = deque(maxlen=spec.delay // spec.every + 2)
 
     def write(self, tick: int, cycle: int) -> None:
-        """Write the message in the cycle of `cycle` ticks released at `tick`, if this is one that
-        writes it.
+        """Write the message, if the present cycle is one that writes it.
+
+        Args:
+            tick: Tick at which the cycle was released.
+            cycle: Length of the cycle, ticks.
         """
         if not (tick + cycle - self.spec.phase) % self.spec.every:
             self.serial += 1
             self.kept.append((tick + self.spec.delay, self.serial, bytes(self.message.raw)))
 
     def newest(self, tick: int) -> tuple[int, bytes] | None:
-        """Return serial and bytes of the newest message visible at `tick`; None: there is none."""
+        """Return serial and bytes of the newest message visible at `tick`. None without one."""
         for visible_at, serial, data in reversed(self.kept):
             if visible_at <= tick:
                 return serial, data
@@ -151,7 +165,7 @@ class Post:
 
 
 class PostReader:
-    """One reader of a mailbox."""
+    """Reader of a `Post`, which returns messages with verdicts as a board's reader does."""
 
     def __init__(self, post: Post, kind: type[Message]) -> None:
         self._post = post
@@ -160,7 +174,7 @@ class PostReader:
         self._readings = {verdict: Reading(self._message, verdict) for verdict in Verdict}
 
     def read(self, tick: int) -> Reading[Message]:
-        """Return the newest message visible at `tick`, and its verdict."""
+        """Return the newest message visible at `tick` with its verdict."""
         newest = self._post.newest(tick)
         if newest is None:
             return self._readings[Verdict.NONE]
@@ -173,7 +187,13 @@ class PostReader:
 
 
 class LoneTask:
-    """An executor or a planner with its ports."""
+    """An executor or planner with its ports connected to mailboxes in private memory.
+
+    Args:
+        layout: Layout of the rack.
+        wiring: Wiring of the task.
+        posts: All mailboxes by name.
+    """
 
     def __init__(self, layout: Layout, wiring: TaskWiring, posts: Mapping[str, Post]) -> None:
         self.spec = layout.task(wiring.task)
@@ -183,7 +203,8 @@ class LoneTask:
         )
         kind.preload()
         self.level = level = kind(wiring.context)
-        # Where each reading goes: the level's ports, or the dict of one that reads many mailboxes.
+        # Table, key and function of each reading. The table belongs to the level's ports, or to one
+        # port that reads several mailboxes.
         self._readers: list[tuple[dict[str, Any], str, Callable[[int], Reading[Message]]]] = []
         for port, source in wiring.inputs.items():
             message = level.inputs[port].message if port in level.inputs else AnyMessage

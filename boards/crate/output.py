@@ -1,6 +1,4 @@
-"""What host boards print: lines of bounded length, of each board as many as a run keeps; the others
-are counted.
-"""
+"""Output of host boards: lines of bounded length and number. Further lines are only counted."""
 
 from __future__ import annotations
 
@@ -9,23 +7,25 @@ import re
 from contextlib import suppress
 
 MOST_LINES = 10_000
-"""Lines of one host board that a run keeps."""
+"""Largest number of lines of one host board that a run keeps."""
 LONGEST_LINE = 1000
-"""Bytes after which a line is cut: what follows is a line of its own."""
+"""Longest line, bytes. The rest of a longer line becomes another line."""
 MOST_READ = 1 << 16
 _LINE = re.compile(rb"[^\n]{%d}\n?|[^\n]*\n" % LONGEST_LINE)
 
 
 def lines_of(data: bytes) -> list[bytes]:
-    """Return the lines that are whole or cut, with their ends; the rest is a line that has not
-    ended.
+    """Split output into complete lines with their line ends. Long lines are cut.
+
+    An incomplete line at the end is left out.
     """
     return _LINE.findall(data)
 
 
 class HostOutput:
-    """The pipe into which all processes of one host board print. The crate empties it to its own
-    stdout.
+    """Pipe into which the processes of one host board print.
+
+    The crate copies it to its own standard output.
     """
 
     def __init__(self, board: str) -> None:
@@ -42,8 +42,10 @@ class HostOutput:
         os.close(self.writer)
 
     def pass_on(self, is_over: bool = False) -> None:
-        """Pass on what has come; say what was dropped each time that it has doubled, and when the
-        board `is_over`.
+        """Copy new output. Each time that the number of dropped lines has doubled, print it.
+
+        Args:
+            is_over: Whether the board has ended, so that an incomplete line is complete.
         """
         with suppress(BlockingIOError):
             self._rest += os.read(self.reader, MOST_READ)
@@ -51,10 +53,10 @@ class HostOutput:
             self._rest += b"\n"
         lines = lines_of(self._rest)
         self._rest = self._rest[sum(map(len, lines)) :]
-        kept = lines[: max(0, MOST_LINES - self._lines)]
+        first_lines = lines[: max(0, MOST_LINES - self._lines)]
         self._lines += len(lines)
-        if kept:
-            os.write(1, b"".join(line.rstrip(b"\n") + b"\n" for line in kept))
+        if first_lines:
+            os.write(1, b"".join(line.rstrip(b"\n") + b"\n" for line in first_lines))
         if self._lines >= self._next or (is_over and self._lines > MOST_LINES):
             self._next = 2 * self._lines
             dropped = self._lines - MOST_LINES

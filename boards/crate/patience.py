@@ -1,6 +1,4 @@
-"""Waits, with a line to the user when they take long: during a launch, and in lockstep for another
-rack.
-"""
+"""Waits that are reported to the user if they take long, during a launch or for another rack."""
 
 from __future__ import annotations
 
@@ -15,15 +13,18 @@ from rack.boards.events import Journal
 from rack.boards.lan.awaited import awaited
 
 COMPILE_S = 300.0
-"""Time limit of the compilation of one function: thirty times what the longest takes, for a machine
-under load."""
+"""Time limit for compiling one function: thirty times the longest on an idle machine."""
 PATIENCE_S = 2.0
-"""Time after which a launch reports what it waits for; it does so again each time the wait has
-doubled."""
+"""Time after which a wait is reported. It is reported again each time that it has doubled."""
 
 
 class Patience:
-    """One wait of at most `limit_s`. A long one is reported to `journal`."""
+    """A wait with a time limit. If it takes long, it is reported.
+
+    Args:
+        journal: Journal to which a long wait is reported.
+        limit_s: Longest time to wait, s.
+    """
 
     def __init__(self, journal: Journal, limit_s: float) -> None:
         self._journal = journal
@@ -38,16 +39,16 @@ class Patience:
 
     @property
     def left_s(self) -> float:
-        """Time until the next report or the time limit, s."""
+        """Time until the next report is due or the time limit is reached, s."""
         return max(0.0, min(self._report_s, self._limit_s) - self._waited_s)
 
     def renew(self, limit_s: float) -> None:
-        """Begin the time limit again, of another length; reports go on as before."""
+        """Start another time limit now. The times of reports do not change."""
         self.limit_s = limit_s
         self._limit_s = self._waited_s + limit_s
 
     def report(self, doing: str) -> None:
-        """Report what the launch waits for, if that is due."""
+        """Report the wait if a report is due. `doing` is a clause that says what is in progress."""
         if self._waited_s >= self._report_s:
             self._journal.add("waiting", "", f"{doing}, {self._waited_s:.0f} s so far")
             self._report_s *= 2.0
@@ -58,9 +59,7 @@ class Patience:
 
 
 class RackAwaited:
-    """Reports for which other rack an adapter waits in lockstep, which may take as long as it
-    wants.
-    """
+    """Reports of adapters that wait for another rack in lockstep, which has no time limit."""
 
     def __init__(self, segment: Segment, journal: Journal) -> None:
         self._segment = segment
@@ -68,7 +67,7 @@ class RackAwaited:
         self._patience: Patience | None = None
 
     def look(self) -> None:
-        """Report it, if that is due."""
+        """Report the racks that adapters wait for, if a report is due."""
         waits = list(awaited(self._segment))
         if not waits:
             self._patience = None
@@ -79,10 +78,18 @@ class RackAwaited:
 
 
 def await_opened(crate: CrateLine, journal: Journal, limit_s: float) -> int:
-    """Wait until the crate has preloaded the levels and opened the segment; `limit_s` is for each
-    class. Return the tick of the snapshot from which the rack goes on, -1 without one.
+    """Wait until the crate has preloaded the levels and opened the segment.
 
-    Raises `LaunchError` if a class cannot be preloaded, and when the time limit is exceeded.
+    Args:
+        crate: The crate.
+        journal: Journal to which a long wait is reported.
+        limit_s: Time limit for each class, s.
+
+    Returns:
+        Tick of the snapshot from which the rack continues. -1 without one.
+
+    Raises:
+        LaunchError: A class cannot be preloaded, or the time limit is exceeded.
     """
     patience = Patience(journal, limit_s)
     doing = "the crate is starting"

@@ -19,6 +19,7 @@ from rack.boards.config.commands import asked, request
 from rack.boards.config.loader import load
 from rack.boards.config.resolved import Resolved, classes, resolve
 from rack.boards.config.schema import RackConfig
+from rack.boards.crate import launch_checks
 from rack.boards.crate.clean import remove_dead, remove_own
 from rack.boards.crate.line import CrateLine
 from rack.boards.crate.neighbours import conflicts, holders, placed
@@ -31,28 +32,35 @@ from rack.boards.faults.kind import KINDS
 from rack.boards.wiring import Continuation, Entries, SnapshotPolicy
 
 LAUNCH_S = 60.0
-"""Time limit of each step of the launch: to preload one class, which may compile code, or to ready
-all boards."""
+"""Time limit for each step of the launch, such as preloading one class or starting all boards."""
 TO_SHARE = "stop that rack, choose other cores, or use --share"
 LEAVE_S = 2.0
-"""Time for the boards to end by themselves."""
+"""Time that the boards have to end by themselves."""
 LOOK_S = 0.5
-"""Time between two looks at boards that do not ask for one."""
+"""Time between two checks of the boards if none of them reports anything."""
 
 
 class Rack:
-    """A rack of boards. Use it as a context: `with Rack.from_file("nasrem") as rack:
-    rack.run(seconds=10)`.
+    """Rack of boards: launches, supervises and ends them.
 
-    `on_event` is called with every `Event`, in the caller's process; of a run in the background, in
-    its thread. Without `share`, a launch is refused if another rack's real-time boards occupy a
-    core that this one requests. A `crate` that was started earlier saves time. With `entries`, by
-    adapter and port, host boards are not started, and other racks not met: what a recorded run
-    wrote there enters instead. `snapshots`: those that it takes in lockstep. `continues`: the
-    snapshot of its `crate` from which it goes on. `requests`: an operator's commands besides the
-    config's, and those that wait in the snapshot, by their ticks. `begins_at`: the tick of that
-    snapshot; -1 without one. `repeats`: the rack whose run
-    this repeats under a name of its own; levels see the name of that.
+    Use it as a context: `with Rack.from_file("nasrem") as rack: rack.run(seconds=10)`.
+
+    Args:
+        config: Config of the rack.
+        on_event: Function called with every `Event` in this process. During a run in the background
+            it is called in the thread of that run.
+        share: Whether this rack may use cores that real-time boards of other racks occupy. If
+            False, such a launch is refused.
+        crate: A crate that was started earlier, which saves time. None to start one.
+        entries: For a replay, what each adapter wrote in the recorded run. These messages enter
+            again; host boards are not started and other racks are not contacted.
+        snapshots: When to take snapshots, which needs lockstep. None for no snapshots.
+        continues: Snapshot of `crate` from which the run continues. None to start a new run.
+        requests: Operator commands in addition to those of the config, in the order of their ticks.
+        repeats: Name of the rack whose run is repeated under another name. Levels see this name.
+
+    Attributes:
+        begins_at: Tick of the snapshot from which the run continues. -1 without one.
     """
 
     def __init__(
@@ -83,22 +91,26 @@ class Rack:
 
     @property
     def events(self) -> list[Event]:
-        """The events so far."""
+        """All events so far."""
         return self._journal.events
 
     @property
     def segment(self) -> Segment:
-        """Memory of the rack, from its launch on."""
+        """Segment of the rack. It exists from the launch on."""
         return self._supervisor.segment
 
     @property
     def outcome(self) -> Outcome | None:
-        """How the run ended; None: it has not."""
+        """Outcome of the run. None while it lasts."""
         return None if self._launched is None else self._launched.outcome
 
     @classmethod
     def from_file(cls, name_or_path: str | Path, overrides: Sequence[str] = ()) -> Self:
-        """Return the rack of a config, by name or path. Raises `ConfigError` with every mistake."""
+        """Return the rack of a config, given by name or path, with settings `key.sub=value`.
+
+        Raises:
+            ConfigError: The config has mistakes. All of them are listed.
+        """
         return cls(load(str(name_or_path), overrides))
 
     def __enter__(self) -> Self:
@@ -109,14 +121,18 @@ class Rack:
     def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
         self.close()
         if kind is None:
-            # It raises what ended the supervision.
+            # This raises an error that ended the supervision in the background.
             self.wait(0)
 
     def launch(self) -> None:
         """Power on every board except the clock, and wait until all have passed their self-tests.
 
-        Raises `ConfigError` for an invalid config or occupied cores, `SegmentError` if the name is
-        in use, and `LaunchError` if a board fails; in each case nothing is left behind.
+        If the launch fails, no process and no segment is left behind.
+
+        Raises:
+            ConfigError: The config has mistakes, or the cores are occupied.
+            SegmentError: The name of the rack is in use.
+            LaunchError: A board failed.
         """
         try:
             self._power_on()
@@ -125,41 +141,42 @@ class Rack:
             raise
 
     def _power_on(self) -> None:
-        held = holders(self.config.name)
-        self.config, moved = placed(self.config, held)
-        shared = conflicts(self.config, held)
+        """Carry out the steps of a launch. After an error the caller must close the rack."""
+        occupied = holders(self.config.name)
+        self.config, moved = placed(self.config, occupied)
+        shared = conflicts(self.config, occupied)
         if shared and not self._share:
             raise ConfigError([Mistake(line, None, TO_SHARE) for line in shared])
-        # Reported first, because the next steps take long on occupied cores.
+        # Report occupied cores first, because the next steps take long on them.
         for note in shared:
             self._journal.add("waiting", "", note)
         self._crate = crate = self._crate or CrateLine()
-        # The crate imports while this process resolves the config: with two cores this saves 0.5 s.
-        # A level's module may have ended it: then resolving says which.
+        # The crate imports levels while this process resolves the config, which saves 0.5 s on two
+        # cores. If a level's module ends the crate, `resolve` reports which module that is.
         crate.ask(Preload(classes(self.config), tuple(sys.path), cell_of(self.config)))
         plan = resolve(self.config).for_run(self._repeats, self._entries)
         if self._snapshots is not None:
-            # In a replay what came from outside is in the wiring.
+            # In a replay the wiring contains what came from outside.
             why = "" if plan.is_replay else self.config.outside
             if self.config.clock.mode != "lockstep":
                 why = "they are taken in lockstep; add --lockstep"
             if why:
                 raise SnapshotError(f"rack '{self.config.name}' has no snapshots: {why}")
-        plan.check_files()
+        launch_checks.check_open_files(plan)
         remove_dead(self.config.name)
         segment = Segment.create(plan.layout, self.config.text(), plan.published.text())
         self._journal.segment = segment
         self._launched = supervisor = Supervisor(segment, plan, crate, self._journal)
         words = segment.words
         clock = self.config.clock
-        # The latch is set at first: until it is reset, the brakes stay engaged.
+        # The emergency-stop latch is set first. The brakes stay engaged until it is reset.
         words[System.EMERGENCY_STOP] = 1
         words[System.LOCKSTEP] = clock.mode == "lockstep"
         words[System.PERIOD_NS] = round(self.config.clock_ns / clock.speed)
-        if (wanted := self._snapshots) is not None:
-            words[System.SNAPSHOT_PART] = wanted.part
-            words[System.SNAPSHOT_EVERY] = wanted.every
-            words[System.SNAPSHOT_AT] = 0 if wanted.at is None else wanted.at + 1
+        if (policy := self._snapshots) is not None:
+            words[System.SNAPSHOT_PART] = policy.part
+            words[System.SNAPSHOT_EVERY] = policy.every
+            words[System.SNAPSHOT_AT] = 0 if policy.at is None else policy.at + 1
         before = None if self._continues is None else self._continues.tick
         crate.send(Open(self.config.name, plan.crate_priority, before))
         self._journal.add(
@@ -171,15 +188,13 @@ class Rack:
         for wiring in plan.tasks:
             crate.send(PowerOn(wiring.task, wiring))
         supervisor.await_ready(LAUNCH_S)
-        plan.check_realtime(segment)
+        launch_checks.check_realtime(plan, segment)
         self._inject(plan, crate)
-        for note in (*moved, *plan.notes(segment)):
+        for note in (*moved, *launch_checks.list_launch_notes(plan, segment)):
             self._journal.add("ready", "", note)
 
     def _inject(self, plan: Resolved, crate: CrateLine) -> None:
-        """Fill the tables with the config's faults and commands; start the faults that are
-        processes.
-        """
+        """Enter the config's faults and commands into their tables, and start hog processes."""
         table = FaultTable(self.segment)
         before = self._continues or Continuation(0)
         for injection in plan.faults[before.faults :]:
@@ -187,34 +202,38 @@ class Rack:
             if KINDS[injection.kind].where == "core":
                 crate.send(PowerOn(f"hog {entry.index}", HogWiring(entry.index)))
         desk = OperatorTable(self.segment)
-        # A snapshot has those that waited, and leases, of which no client can be here.
+        # A snapshot contains pending commands, and also leases of clients that no longer exist.
         for lease in desk.leased():
             desk.release(lease)
-        for wanted in (*plan.commands[before.commands :], *desk.lacking(self._requests)):
-            desk.add(wanted)
+        for request_entry in (*plan.commands[before.commands :], *desk.lacking(self._requests)):
+            desk.add(request_entry)
 
     def follow(self, events: Iterable[Event]) -> None:
-        """Take over the events of the run that this one continues, from before its snapshot: the
-        outcome counts them.
+        """Take over events of the continued run from before its snapshot.
+
+        The outcome of this run counts them.
         """
         self._journal.events.extend(events)
 
     def start(self, seconds: float | None = None) -> None:
-        """Power on the clock, which begins the run. It lasts `seconds` of simulated time, or until
-        the task ends.
+        """Power on the clock, which begins the run.
+
+        Args:
+            seconds: Simulated time that the run lasts, s. None to run until the task ends.
         """
         supervisor = self._supervisor
         plan = supervisor.plan
         clock = plan.clock(seconds)
         if self._snapshots is not None or self._continues is not None:
-            # Not in the clock's wiring: what goes on from a snapshot may end at another tick.
+            # Keep the last tick out of the clock's wiring: a run that continues from a snapshot may
+            # end at another tick, and its wiring must be the same.
             stop = max(clock.stop_tick, self.begins_at) if clock.stop_tick else 0
             self.segment.words[System.STOP_TICK] = stop
             clock = replace(clock, stop_tick=0)
         if self._continues is None:
             supervisor.reset_latch()
         else:
-            # The latch is as it was, and what was raised before is in the other run's events.
+            # The latch is in the snapshot, and earlier alarms are events of the continued run.
             supervisor.is_armed = True
             supervisor.alarms.drain()
             tick = self.begins_at
@@ -226,20 +245,20 @@ class Rack:
         self._journal.add("start", CLOCK, self.config.clock.mode)
 
     def run(self, seconds: float | None = None) -> Outcome:
-        """Run for `seconds` of simulated time, or until the task ends; return the outcome."""
+        """Run for `seconds` of simulated time, or until the task ends, and return the outcome."""
         self.start(seconds)
         while (outcome := self.outcome) is None:
             self.watch(LOOK_S)
         return outcome
 
     def run_in_background(self, seconds: float | None = None) -> None:
-        """Begin to run as `run` does, and return: a thread supervises the boards until the run is
-        over, or the rack closed.
+        """Begin a run as `run` does and return at once, while a thread supervises the boards.
 
-        Whatever holds the interpreter's lock for long delays restarts, not the boards.
+        Code that holds the interpreter's lock for long delays restarts of boards, not the boards.
         """
         self.start(seconds)
-        # A notebook's rack may never be closed; the interpreter does not wait for a daemon.
+        # In a notebook a rack may never be closed, and the interpreter does not wait for a daemon
+        # thread.
         atexit.register(self.close)
         self._thread = Thread(target=self._supervise, daemon=True)
         self._thread.start()
@@ -249,14 +268,21 @@ class Rack:
             while self.watch(LOOK_S):
                 continue
         except BaseException as error:
-            # Nobody watches the boards any more. `wait` and the end of the context show it.
+            # The boards are no longer supervised. `wait` and `__exit__` raise the error.
             self._failed = error
             self._supervisor.end_boards()
 
     def wait(self, timeout_s: float | None = None) -> Outcome | None:
-        """Wait until the run in the background is over; return its outcome, None if it goes on.
+        """Wait until the run in the background is over.
 
-        Raises what ended its supervision, such as an error of `on_event`.
+        Args:
+            timeout_s: Longest time to wait, s. None to wait without a limit.
+
+        Returns:
+            The outcome. None if the run is not over.
+
+        Raises:
+            BaseException: The error that ended the supervision, such as one raised by `on_event`.
         """
         if self._thread is not None:
             self._thread.join(timeout_s)
@@ -265,32 +291,38 @@ class Rack:
         return self.outcome
 
     def watch(self, timeout_s: float) -> bool:
-        """Supervise the boards for `timeout_s` or until the run is over; return False when it is
-        over.
-        """
+        """Supervise the boards for `timeout_s` or until the run ends. Return False if it has."""
         return self._supervisor.watch(timeout_s)
 
     def stop(self, why: str = "stopped by its program") -> None:
-        """End the run at the next tick. May be called at any time, even from a signal handler."""
+        """End the run at the next tick. May be called at any time, even by a signal handler."""
         self._supervisor.stop(why)
 
     def command(
         self, level: str, what: str, tick: int | None = None, **goal: object
     ) -> RequestEntry:
-        """Issue an operator command to a level, at `tick` or at once; return its entry in the
-        operator table.
+        """Issue an operator command to a level, as in `rack.command("task", "hold")`.
 
-        `what` and `goal` are as in a `[[command]]` table: `rack.command("servo", "setpoint",
-        joints=(...))`. Raises `ConfigError` with every mistake, `OperatorTableError` if too many
-        are pending.
+        Args:
+            level: Board of the level.
+            what: The command, as in a `[[command]]` table.
+            tick: Tick at which it is issued. None for at once.
+            goal: Further keys of a `[[command]]` table, such as `joints=(...)`.
+
+        Returns:
+            The entry of the command in the operator table.
+
+        Raises:
+            ConfigError: The command has mistakes. All of them are listed.
+            OperatorTableError: Too many commands are pending.
         """
-        wanted = asked({"level": level, "what": what, "tick": tick, **goal})
+        command = asked({"level": level, "what": what, "tick": tick, **goal})
         plan = self._supervisor.plan
-        found = request(wanted, self.config, plan.published.levels, plan.layout)
-        return OperatorTable(self.segment).add(found)
+        entry = request(command, self.config, plan.published.levels, plan.layout)
+        return OperatorTable(self.segment).add(entry)
 
     def close(self) -> None:
-        """End everything: no process and no segment of this rack is left."""
+        """End the rack. No process and no segment of it is left."""
         atexit.unregister(self.close)
         if (crate := self._crate) is None:
             return
@@ -303,14 +335,14 @@ class Rack:
             if (launched := self._launched) is not None:
                 launched.end_boards()
                 tasks = launched.plan.layout.tasks
-                lost = any(self.segment.block(task.name)[Block.LOST] for task in tasks)
-                if lost or launched.recovery.given_up:
+                is_any_lost = any(self.segment.block(task.name)[Block.LOST] for task in tasks)
+                if is_any_lost or launched.recovery.given_up:
                     crate.ask(PowerOff())
-                # A crate without boards may still be importing: do not wait for it.
+                # Do not wait for a crate without boards, which may still be importing.
                 leave_s = LEAVE_S if launched.pids else 0.0
             crate.close(leave_s)
         finally:
-            # By name: the launch may have been interrupted before the segment was known.
+            # Remove the segment by name: the launch may have been interrupted before it was stored.
             remove_own(self.config.name)
             if self._launched is not None:
                 self.segment.close()
@@ -322,5 +354,5 @@ class Rack:
 
 
 def cell_of(config: RackConfig) -> CellConfig | None:
-    """Return what the crate needs to compile the cell of a rack; None without an arm."""
+    """Return the tables that the crate needs to compile the cell. None without an arm."""
     return None if config.robot is None else CellConfig(config.robot, config.scene, config.clock_ns)

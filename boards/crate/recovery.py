@@ -1,8 +1,8 @@
-"""What follows when a process of a rack ends: it is recorded, and restarted or given up.
+"""Restarts of lost boards: their limit, their order, and their execution.
 
-The limit and the order of restarts, and the restarts themselves: of boards, on the clock's grid; of
-host boards, which in real time are never waited for. The loss of a host board demands nothing of
-the arm. The clock admits its return, as it does that of other boards.
+The end of each process is recorded, and the board is restarted or given up. Boards rejoin on the
+clock's grid. In real time nothing waits for host boards, and their loss has no effect on the arm.
+The clock admits the return of a host board as it does for other boards.
 """
 
 from __future__ import annotations
@@ -24,19 +24,20 @@ from rack.boards.events import Journal
 from rack.boards.wiring import ClockWiring, HostWiring, TaskWiring
 
 UP = (TaskState.READY, TaskState.RUNNING)
-"""States of a board that has passed its self-test."""
+"""States of a board that has passed its self-test and has not ended."""
 
 
 class Supervision:
-    """The restart policy of a rack. It counts in ticks, so that in lockstep the same losses have
-    the same outcome.
+    """Restart policy of a rack.
+
+    It counts in ticks, so that equal losses in lockstep have equal outcomes.
     """
 
     def __init__(self, config: RackConfig, layout: Layout) -> None:
         self._config = config
         self._layout = layout
         self._restarts: dict[str, list[int]] = defaultdict(list)
-        # Of the clock and of host boards nothing.
+        # Names that each task depends on. The clock and host boards depend on nothing.
         self._needs: dict[str, set[str]] = defaultdict(set)
         for task in layout.tasks:
             below = config.all_below(task.board)
@@ -46,16 +47,18 @@ class Supervision:
             )
 
     def admit(self, task: str, tick: int) -> str:
-        """Count one more restart of a task, lost at `tick`; return which one it is, as text, empty
-        if no more are permitted.
+        """Request a restart of a task that was lost at `tick`, and count it if it is permitted.
+
+        Returns:
+            The number of the restart, as text. Empty if no more restarts are permitted.
         """
         common = self._config.supervision
         most, within_s = common.restarts, common.within_s
         if task != CLOCK:
             board = self._config.table(self._layout.task(task))
             most = most if board.restarts is None else board.restarts
-            own_s = board.restarts_within_s
-            within_s = within_s if own_s is None else own_s
+            board_s = board.restarts_within_s
+            within_s = within_s if board_s is None else board_s
         since = tick - within_s * 1e9 / self._layout.clock_ns
         recent = [at for at in self._restarts[task] if at > since]
         if len(recent) >= most:
@@ -64,31 +67,37 @@ class Supervision:
         return f"restart {len(recent) + 1} of at most {most} in {within_s:g} s"
 
     def in_order(self, tasks: list[str]) -> list[str]:
-        """Return the tasks in order of restart: the clock, then lower levels before higher,
-        executor before planner.
+        """Return the tasks in the order of restart.
+
+        The clock comes first, lower levels come before higher ones, executors before planners.
         """
-        # A task always needs more than any task that it needs, so sorting by count is enough.
+        # A task has more dependencies than any task it depends on, so sorting by count is enough.
         return sorted(tasks, key=lambda task: len(self._needs[task]))
 
     def must_wait(self, task: str, absent: list[str]) -> bool:
-        """Say whether a task on which this one depends is still absent: any below it, or a
-        planner's executor.
+        """Return True if a task on which this one depends is still absent.
+
+        A task depends on all tasks below it, and a planner also on its executor.
+
+        Args:
+            task: The task.
+            absent: Names of the absent tasks.
         """
         return not self._needs[task].isdisjoint(absent)
 
 
 class Recovery:
-    """The lost boards of a rack, from loss to return.
+    """Recovery of lost boards.
 
-    A board is powered on again once everything on which it depends is present; it rejoins on the
+    A board is powered on again once everything that it depends on is present. It rejoins on the
     clock's grid.
 
     Attributes:
-        wirings: The boards of the run, and its host boards that are not external, by name. Before
-            the run there are none, and no board is restarted.
+        wirings: Wiring of all boards and of the host boards that are not external, by name. Empty
+            before the run; until then no board is restarted.
         faults: A line for each board that was given up.
-        given_up: Whether a board, or all of them with the crate, was given up.
-        is_beyond_help: Whether the run cannot go on.
+        given_up: Whether a board, or the crate with all boards, was given up.
+        is_beyond_help: Whether the run cannot continue.
     """
 
     def __init__(
@@ -107,7 +116,7 @@ class Recovery:
         self._stopped: set[str] = set()
 
     def start(self, clock: ClockWiring, plan: Resolved) -> None:
-        """Power on the clock and the host boards; restart boards from now on."""
+        """Power on the clock and the host boards. From now on, lost boards are restarted."""
         self.wirings = {
             CLOCK: clock,
             **{host.board: host for host in plan.hosts if not host.is_external},
@@ -118,9 +127,12 @@ class Recovery:
                 self._crate.ask(PowerOn(name, wiring))
 
     def lose(self, end: Ended, is_over: bool, record_printed: Callable[[], None]) -> None:
-        """Record the end of a board, and restart it or give it up; `is_over`: so is the run.
+        """Record the end of a board, and restart it or give it up.
 
-        `record_printed` records what boards have printed.
+        Args:
+            end: The crate's report on the end.
+            is_over: Whether the run is over.
+            record_printed: Function that records the lines that boards have printed.
         """
         name = end.name
         is_host = isinstance(self.wirings.get(name), HostWiring)
@@ -146,32 +158,31 @@ class Recovery:
         if name == CLOCK:
             self.is_beyond_help = True
         else:
-            # The clock reacts to this: it brakes the arm and ends the run.
+            # The clock reacts to this state by braking the arm and ending the run.
             self._segment.block(name)[Block.STATE] = TaskState.GIVEN_UP
         self._give_up(name, text, is_host)
 
     def lose_crate(self) -> None:
-        """Record the end of the crate."""
+        """Record the end of the crate, with which all boards have ended."""
         self.is_beyond_help = True
         text = "the crate ended, and all boards with it"
         self._journal.add("died", "crate", text, "died")
         self._give_up("crate", text)
 
     def report_hanging(self, board: str, why: str = "") -> None:
-        """Record that a board hangs."""
+        """Record that a board hangs, followed by `why`."""
         text = f"'{board}' is not responding{why}"
         self._journal.add("detection", "rack", text, "hang", subject=board)
 
     def end_hanging(self, board: str) -> None:
-        """Kill a hanging board, which is then lost like any other; one that is being restarted is
-        left alone.
-        """
+        """Kill a hanging board, so that it is lost, unless it is already being restarted."""
         if board not in (*self._waiting, *self._starting):
             self._crate.ask(PowerOff(board))
 
     def advance(self) -> None:
-        """Power on the boards that are due, and end host boards that a signal has stopped: nothing
-        else shows that one hangs.
+        """Power on boards whose dependencies are present, and kill stopped host boards.
+
+        A host board that a signal has stopped is not detected in any other way.
         """
         self._starting = [
             name
@@ -192,7 +203,7 @@ class Recovery:
                 self._crate.ask(PowerOff(name))
 
     def _reason(self, board: str) -> str:
-        """Return the reason that a board printed last; empty: none."""
+        """Return the last reason that a board has printed. Empty if it has printed none."""
         printed = (event.text for event in reversed(self._journal.events))
         return next((text for text in printed if text.startswith(f"board '{board}': ")), "")
 

@@ -1,7 +1,7 @@
-"""Messages between the Rack and its crate: requests, and the crate's answers.
+"""Requests of the Rack to its crate, and the crate's answers.
 
-This module imports nothing heavy: the first request is sent before the libraries that read a config
-are loaded.
+This module imports very little, because the first request is sent before the libraries that read a
+config are loaded.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class CellConfig:
-    """Inputs of the compiled cell."""
+    """Tables of a config from which the cell is compiled."""
 
     robot: RobotConfig
     scene: SceneConfig
@@ -25,11 +25,12 @@ class CellConfig:
 
 @dataclass(frozen=True)
 class Preload:
-    """Import and preload these classes of levels, as "package.module:Class", with `path` as import
-    path.
+    """Request to import and preload levels, which the boards forked later then share.
 
-    With a cell, compile its cell, too. Boards forked later share all of it. What is loaded already
-    costs nothing.
+    Attributes:
+        classes: Classes of levels, as "package.module:Class". Those already loaded cost nothing.
+        path: The import path.
+        cell: Cell that is compiled as well. None for a rack without an arm.
     """
 
     classes: tuple[str, ...]
@@ -39,10 +40,13 @@ class Preload:
 
 @dataclass(frozen=True)
 class Open:
-    """Attach to a rack's segment; take this SCHED_FIFO priority, if permitted.
+    """Request to attach to the segment of a rack.
 
-    The crate must notice deaths without waiting for planners to finish; no board waits for the
-    crate. With `before`, the rack goes on from the last snapshot at that tick or before.
+    Attributes:
+        rack: Name of the rack.
+        priority: SCHED_FIFO priority of the crate, if the system permits it. The crate must notice
+            the end of a board even while planners compute, but no board waits for the crate.
+        before: Continue from the last snapshot at or before this tick. None for a new run.
     """
 
     rack: str
@@ -52,16 +56,17 @@ class Open:
 
 @dataclass(frozen=True)
 class HogWiring:
-    """A hog: its entry in the fault table."""
+    """Wiring of a hog, which occupies a core: the index of its entry in the fault table."""
 
     entry: int
 
 
 @dataclass(frozen=True)
 class PowerOn:
-    """Fork one board: a task, the clock, a host board, or a hog, which occupies a board's core.
+    """Request to fork one process: a task, the clock, a host board or a hog.
 
-    In a rack that goes on from a snapshot, a board that is wired as it was then goes on.
+    If the rack continues from a snapshot and the wiring is unchanged, the board's copy continues
+    instead.
     """
 
     name: str
@@ -70,14 +75,14 @@ class PowerOn:
 
 @dataclass(frozen=True)
 class PowerOff:
-    """Kill one board, or every board still running."""
+    """Request to kill one board. Without a name, every board that is still running is killed."""
 
     name: str | None = None
 
 
 @dataclass(frozen=True)
 class Leave:
-    """End the boards of this rack, and wait for another one's requests."""
+    """Request to end the boards of this rack and wait for requests of another rack."""
 
 
 @dataclass(frozen=True)
@@ -87,21 +92,21 @@ class Left:
 
 @dataclass(frozen=True)
 class Preloading:
-    """The crate begins to preload a class."""
+    """Report that the crate begins to preload a class."""
 
     kind: str
 
 
 @dataclass(frozen=True)
 class Compiling:
-    """The crate begins to compile a function: its code is not kept from an earlier launch."""
+    """Report that the crate begins to compile a function that no earlier launch has compiled."""
 
     function: str
 
 
 @dataclass(frozen=True)
 class PreloadFailed:
-    """A class raised an error while it was preloaded; no board can be forked."""
+    """Report that preloading a class failed, so that no board can be forked."""
 
     kind: str
     error: str
@@ -109,8 +114,10 @@ class PreloadFailed:
 
 @dataclass(frozen=True)
 class Opened:
-    """Answer to `Open`: the `tick` of the snapshot from which the rack goes on; -1: there is none,
-    or none was wanted.
+    """Answer to `Open`.
+
+    Attributes:
+        tick: Tick of the snapshot from which the rack continues. -1 without one.
     """
 
     tick: int = -1
@@ -118,7 +125,7 @@ class Opened:
 
 @dataclass(frozen=True)
 class Show:
-    """Show the attributes of the level of a task in the last snapshot at `tick` or before."""
+    """Request for the attributes of a task's level in the last snapshot at or before a tick."""
 
     tick: int
     task: str
@@ -126,7 +133,12 @@ class Show:
 
 @dataclass(frozen=True)
 class Shown:
-    """Answer to `Show`: the tick of the snapshot, -1 without one, and the attributes as JSON."""
+    """Answer to `Show`.
+
+    Attributes:
+        tick: Tick of the snapshot. -1 without one.
+        attributes: Attributes of the level, as JSON.
+    """
 
     tick: int
     attributes: str
@@ -134,7 +146,7 @@ class Shown:
 
 @dataclass(frozen=True)
 class Forked:
-    """A board was forked."""
+    """Report that a board was forked."""
 
     name: str
     pid: int
@@ -142,9 +154,14 @@ class Forked:
 
 @dataclass(frozen=True)
 class Ended:
-    """A board's process has ended; `status` is negative for a signal, as in subprocess.
+    """Report that the process of a board has ended.
 
-    `seen_ns` (CLOCK_MONOTONIC) and `tick` are the time at which the crate noticed.
+    Attributes:
+        name: Name of the board.
+        pid: The process.
+        status: Exit status. Negative for a signal, as in `subprocess`.
+        seen_ns: Time at which the crate noticed the end, CLOCK_MONOTONIC, ns.
+        tick: Tick at which the board was lost.
     """
 
     name: str
@@ -156,7 +173,7 @@ class Ended:
 
 @dataclass(frozen=True)
 class ForkFailed:
-    """The system refused a process: a board has ended before it began."""
+    """Report that a board could not be forked, as its end and the reason."""
 
     end: Ended
     why: str

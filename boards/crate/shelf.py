@@ -1,9 +1,8 @@
-"""The snapshots that a crate holds: of each process of a rack a copy that waits, and the memory of
-the segment.
+"""Snapshots that a crate holds: a waiting copy of each process of a rack, and of the segment.
 
-They are bounded in number and in memory, and thinned out with age: of the older half, the one goes
-that leaves the smallest gap. A snapshot of which a copy is lost goes whole. All end with the crate:
-it holds the only other end of each copy's line.
+Their number and memory are bounded. When there are too many, the snapshot of the older half is
+dropped whose removal leaves the smallest gap. A snapshot that has lost a copy is dropped as a
+whole. All copies end with the crate, which holds the only other end of each copy's line.
 """
 
 from __future__ import annotations
@@ -23,23 +22,30 @@ from rack.boards.wiring import ClockWiring, TaskWiring
 
 MOST_SNAPSHOTS = 32
 MEMORY_PART = 4
-"""Snapshots have at most one part in so many of the machine's memory."""
+"""Snapshots may use the machine's memory divided by this number."""
 SHOW_S = 10.0
-"""Longest wait for a copy that shows its level."""
+"""Longest wait for a copy that reports the attributes of its level."""
 Wiring = TaskWiring | ClockWiring
 
 
 @dataclass
 class WaitingCopy:
-    """A copy of one process. `pid`: 0 while its successor is not known."""
+    """Waiting copy of one process.
+
+    Attributes:
+        wiring: Wiring of the process.
+        line: Connection to the copy.
+        pid: Process of the copy. 0 if it has continued and its successor is not known yet.
+    """
 
     wiring: Wiring
     line: Connection
     pid: int
 
     def can_be(self, wiring: Wiring) -> bool:
-        """Say whether it can be the board of a wiring: it is that of its own, but for the settings
-        of its level.
+        """Return True if the copy can continue with a wiring.
+
+        Only the context of its level may differ from its present wiring.
         """
         before = self.wiring
         if isinstance(before, TaskWiring) and isinstance(wiring, TaskWiring):
@@ -47,9 +53,17 @@ class WaitingCopy:
         return before == wiring
 
     def go_on(self, wiring: Wiring, rack: str) -> int:
-        """Let it go on in the segment of a rack, as a child of this process, with the context in
-        `wiring`; return its process. Its successor's note follows. Raises `OSError` if it is
-        gone.
+        """Let the copy continue as a board of a rack. Its successor reports by a note later.
+
+        Args:
+            wiring: Wiring with the context that its level gets.
+            rack: Name of the rack, whose segment it attaches to.
+
+        Returns:
+            The process of the copy, which becomes a child of this process.
+
+        Raises:
+            OSError: The copy has ended.
         """
         context = None
         if isinstance(wiring, TaskWiring) and wiring != self.wiring:
@@ -60,7 +74,7 @@ class WaitingCopy:
         return pid
 
     def show(self) -> str:
-        """Return the attributes of its level, as JSON; empty if it is gone."""
+        """Return the attributes of the copy's level as JSON. Empty if the copy has ended."""
         with suppress(EOFError, OSError):
             self.line.send(None)
             if self.line.poll(SHOW_S):
@@ -70,10 +84,14 @@ class WaitingCopy:
 
 @dataclass
 class HeldSnapshot:
-    """The copies of all processes of a rack before `tick`, by name, and its memory, a file.
+    """Snapshot of a rack before a tick.
 
-    `private_bytes`: the memory that it has for itself, when it was last measured. `is_whole`: it
-    has all of them.
+    Attributes:
+        tick: The tick.
+        copies: Copies of all processes, by name.
+        memory: Descriptor of a file with a copy of the segment. -1 until it is received.
+        private_bytes: Memory that the snapshot does not share, at the last measurement.
+        is_whole: Whether all copies are present.
     """
 
     tick: int
@@ -83,16 +101,16 @@ class HeldSnapshot:
     is_whole: bool = False
 
     def measure(self) -> None:
-        """Measure the memory that it has for itself."""
+        """Measure the memory that the snapshot does not share with other processes."""
         self.private_bytes = os.fstat(self.memory).st_size
         for copy in self.copies.values():
             with suppress(OSError):
                 text = Path(f"/proc/{copy.pid}/smaps_rollup").read_text()
-                found = re.findall(r"Private_Dirty: +(\d+)", text)
-                self.private_bytes += sum(int(kib) << 10 for kib in found)
+                sizes = re.findall(r"Private_Dirty: +(\d+)", text)
+                self.private_bytes += sum(int(kib) << 10 for kib in sizes)
 
     def close(self) -> None:
-        """Let go of it in this process."""
+        """Close the descriptors of the snapshot in this process."""
         for copy in self.copies.values():
             copy.line.close()
         if self.memory >= 0:
@@ -100,11 +118,16 @@ class HeldSnapshot:
 
 
 class SnapshotShelf:
-    """The snapshots of the racks of one crate. Boards write to `boards_line` of their copies."""
+    """Snapshots of a crate's racks.
+
+    Attributes:
+        line: Socket from which the crate receives notes about copies.
+        boards_line: Socket to which boards send these notes.
+    """
 
     def __init__(self) -> None:
         self.line, self.boards_line = socketpair(AF_UNIX, SOCK_SEQPACKET)
-        # In the order in which they were taken: the last one may not be whole yet.
+        # In the order in which they were taken. The last one may not be whole yet.
         self._snapshots: list[HeldSnapshot] = []
         sizes = re.findall(r"MemTotal: +(\d+)", Path("/proc/meminfo").read_text())
         self._most_bytes = sum(int(kib) << 10 for kib in sizes) // MEMORY_PART
@@ -114,14 +137,18 @@ class SnapshotShelf:
         return [snapshot for snapshot in self._snapshots if snapshot.is_whole]
 
     def take_note(self, wirings: Mapping[str, Wiring]) -> None:
-        """Take the next note of a board. `wirings`: those of all processes of a snapshot."""
+        """Receive the next note of a board about its copy.
+
+        Args:
+            wirings: Wirings of all processes that a whole snapshot contains.
+        """
         note, files = receive_note(self.line)
         if not files:
             for snapshot in self._held:
                 if snapshot.tick == note.tick:
                     snapshot.copies[note.name].pid = note.pid
             return
-        unfinished = next((one for one in self._snapshots if not one.is_whole), None)
+        unfinished = next((held for held in self._snapshots if not held.is_whole), None)
         if unfinished is not None and unfinished.tick != note.tick:
             self.drop(unfinished)
             unfinished = None
@@ -137,11 +164,12 @@ class SnapshotShelf:
             self._hold(unfinished)
 
     def _hold(self, snapshot: HeldSnapshot) -> None:
+        """Add a whole snapshot, replace one of the same tick, and drop others to stay in bounds."""
         for before in self._held:
             if before.tick == snapshot.tick:
                 self.drop(before)
         for before in self._held[-1:]:
-            # It has got the memory that changes while a rack goes on.
+            # The pages that the rack has changed since are now private to the previous snapshot.
             before.measure()
         self._snapshots.append(snapshot)
         snapshot.is_whole = True
@@ -152,13 +180,14 @@ class SnapshotShelf:
             self.drop(self._most_dispensable())
 
     def _most_dispensable(self) -> HeldSnapshot:
-        """Return the snapshot of the older half, in the order in which they were taken, that leaves
-        the smallest gap between its neighbours; never the newest, or the one of the first tick.
+        """Return the snapshot of the older half whose removal leaves the smallest gap.
+
+        The newest snapshot and the one with the first tick are never chosen.
         """
         held = self._held
         ticks = sorted(snapshot.tick for snapshot in held)
         older = held[: max(2, len(held) // 2)]
-        candidates = [one for one in older if one.tick != ticks[0] and one is not held[-1]]
+        candidates = [old for old in older if old.tick != ticks[0] and old is not held[-1]]
 
         def gap(snapshot: HeldSnapshot) -> int:
             at = ticks.index(snapshot.tick)
@@ -171,26 +200,26 @@ class SnapshotShelf:
 
     @property
     def private_bytes(self) -> int:
-        """The memory that all of them have for themselves."""
+        """Memory that all snapshots together do not share, bytes."""
         return sum(snapshot.private_bytes for snapshot in self._held)
 
     @property
     def pids(self) -> set[int]:
-        """The processes of all copies that are known."""
-        return {copy.pid for one in self._snapshots for copy in one.copies.values()} - {0}
+        """Processes of all copies, as far as they are known."""
+        return {copy.pid for held in self._snapshots for copy in held.copies.values()} - {0}
 
     def nearest(self, tick: int) -> HeldSnapshot | None:
-        """Return the last whole snapshot at `tick` or before; None: there is none."""
-        found = [one for one in self._held if one.tick <= tick]
-        for snapshot in sorted(found, key=lambda one: one.tick, reverse=True):
-            # Every copy waits: nothing else ends the other end of its line.
+        """Return the last whole snapshot at or before `tick`. None if there is none."""
+        earlier = [held for held in self._held if held.tick <= tick]
+        for snapshot in sorted(earlier, key=lambda held: held.tick, reverse=True):
+            # A line that is readable has lost its other end: that copy has ended.
             if all(copy.pid and not copy.line.poll() for copy in snapshot.copies.values()):
                 return snapshot
             self.drop(snapshot)
         return None
 
     def drop(self, snapshot: HeldSnapshot) -> None:
-        """End a snapshot and its processes."""
+        """Remove a snapshot and kill its processes."""
         for copy in snapshot.copies.values():
             if copy.pid:
                 with suppress(ProcessLookupError):
@@ -199,12 +228,12 @@ class SnapshotShelf:
         self._snapshots.remove(snapshot)
 
     def clear(self) -> None:
-        """End all snapshots."""
+        """Remove all snapshots."""
         for snapshot in [*self._snapshots]:
             self.drop(snapshot)
 
     def close_inherited(self) -> None:
-        """Let go of all in a process forked from the crate."""
+        """Close all descriptors in a process that was forked from the crate."""
         self.line.close()
         for snapshot in self._snapshots:
             snapshot.close()

@@ -27,25 +27,25 @@ from rack.boards.errors import UNKEPT, LaunchError
 from rack.boards.events import SUCCESSES, Cause, Ending, Journal, Outcome, brakings
 
 MOST_TICKS = 1 << 48
-"""No run has so many."""
+"""Number of ticks that no run reaches. A larger number in the segment is damage."""
 LAST_S = 0.2
-"""Time for the boards to finish their last cycles before these are counted."""
+"""Time that boards have to finish their last cycles before these are counted."""
 STOP_S = 0.8
-"""Time for the clock to end the run after a stop request, before the Rack does so."""
+"""Time that the clock has to end the run after a stop request. Then the Rack ends it."""
 
 
 class Supervisor:
-    """Watches the boards of a rack, restarts those that are lost, and ends the run.
+    """Watches the boards of a rack, restarts lost boards, and ends the run.
 
     Attributes:
-        segment: Memory of the rack.
-        plan: The rack that was launched.
-        policy: Limits of restarts.
-        recovery: What became of lost boards.
-        alarms: The alarms of the boards.
+        segment: Segment of the rack.
+        plan: The resolved config that was launched.
+        policy: Restart policy.
+        recovery: Recovery of lost boards.
+        alarms: Reader of the boards' alarms.
         pids: Processes of the boards, by name.
-        is_armed: Whether the emergency stop, set at first, was reset.
-        outcome: How the run ended; None: it has not.
+        is_armed: Whether the emergency stop, which is set at first, was reset.
+        outcome: Outcome of the run. None while it lasts.
     """
 
     def __init__(
@@ -67,7 +67,14 @@ class Supervisor:
         self._stop_by: float | None = None
 
     def await_ready(self, limit_s: float) -> None:
-        """Wait until all boards have passed their self-tests. Raises `LaunchError`."""
+        """Wait until all boards have passed their self-tests.
+
+        Args:
+            limit_s: Time limit, s.
+
+        Raises:
+            LaunchError: A board failed, or the time limit is exceeded.
+        """
         patience = Patience(self._journal, limit_s)
         tasks = {task.name: self.segment.block(task.name) for task in self.plan.layout.tasks}
         while absent := [name for name, block in tasks.items() if block[Block.STATE] not in UP]:
@@ -80,9 +87,7 @@ class Supervisor:
             patience.report(f"boards {', '.join(absent)} are starting")
 
     def watch(self, timeout_s: float) -> bool:
-        """Supervise the boards for `timeout_s` or until the run is over; return False when it is
-        over.
-        """
+        """Supervise the boards for `timeout_s` or until the run ends. Return False if it has."""
         deadline = time.monotonic() + timeout_s
         while self.outcome is None:
             self._listen(min(deadline, self._stop_by or deadline) - time.monotonic())
@@ -91,13 +96,13 @@ class Supervisor:
                 self._journal.add("stop", "", self._why_stopped)
             self._record_printed()
             for rung in self.alarms.drain():
-                # Record the event of an alarm, and kill a process that hangs.
+                # Record each alarm as an event, and kill a process that hangs.
                 self._journal.keep(rung.event)
                 if rung.alarm == Alarm.HANG:
                     task = pick(self.plan.layout.tasks, rung.subject, "task")
                     self.recovery.end_hanging(task.name)
                 elif rung.alarm == Alarm.CLOCK_STOPPED and rung.subject == self.pids.get(CLOCK):
-                    # Only the clock that was reported: its successor may be running by now.
+                    # Kill only the clock that was reported. Its successor may already be running.
                     self.recovery.end_hanging(CLOCK)
             for board in self._heartbeat.hanging():
                 self.recovery.report_hanging(board)
@@ -120,13 +125,13 @@ class Supervisor:
         os.eventfd_write(self._crate.attention, 1)
 
     def reset_latch(self) -> None:
-        """Reset the emergency stop on behalf of the caller, as soon as all inputs permit it."""
+        """Reset the emergency-stop latch if all its inputs permit that."""
         with suppress(EmergencyStopError):
             UtilityLines(self.segment).reset_emergency_stop()
             self.is_armed = True
 
     def end_boards(self) -> None:
-        """Declare the run over, to the clock and the boards."""
+        """Tell the clock and the boards that the run is over."""
         self.segment.words[System.STOP_REQUEST] = 1
         self.segment.words[System.STATE] = Run.STOPPED
 
@@ -135,7 +140,7 @@ class Supervisor:
             self._journal.add("ready" if line.startswith(UNKEPT) else "printed", "", line)
 
     def _listen(self, timeout_s: float) -> None:
-        """Wait for the crate or an alarm, at most `timeout_s`."""
+        """Wait for a message of the crate or an alarm, at most `timeout_s`."""
         attention = self._crate.attention
         for ready in wait([self._crate.line, attention], timeout_s):
             if ready == attention:
@@ -158,7 +163,8 @@ class Supervisor:
                 is_board = name == CLOCK or name in self.segment.map.blocks
                 is_over = self._is_stopped or self.outcome is not None
                 if is_board and not (is_over and status == 0):
-                    # Of one that died before the end the policy decides, however late this is read.
+                    # If a board died before the run stopped, the restart policy decides, even if
+                    # its end is reported later.
                     died_before = name != CLOCK and self.segment.block(name)[Block.LOST]
                     is_late = self._is_stopped and not died_before
                     self.recovery.lose(end, is_late, self._record_printed)
@@ -166,7 +172,7 @@ class Supervisor:
                 self.recovery.lose_crate()
 
     def _end(self) -> None:
-        """Record the end of the run (cause, ticks, digest) and let the boards end."""
+        """Determine the outcome of the run, record it, and let the boards end."""
         for rung in self.alarms.drain():
             self._journal.keep(rung.event)
         words = self.segment.words
@@ -183,22 +189,22 @@ class Supervisor:
         if self.recovery.given_up:
             cause = "board lost"
         elif words[System.STOP_REQUEST]:
-            # It may also come from another process, by this word.
+            # Another process may also have requested the stop.
             cause = "stopped"
         faults = self.recovery.faults
         events = self._journal.events
         tick_ms = self.plan.config.clock_ns * 1e-6
-        found = brakings(events, stop, tick_ms)
+        braking_periods = brakings(events, stop, tick_ms)
         if cause in SUCCESSES:
             faults += ending.latched()
         if cause == "time over":
-            faults += ending.held(events, found, stop * tick_ms)
+            faults += ending.held(events, braking_periods, stop * tick_ms)
         objects = ending.ends(self.plan.goals)
         if cause == "task done":
-            # Written so that NaN is too far.
+            # The comparison is written so that NaN counts as too far.
             faults += [str(end) for end in objects if not end.off_mm <= end.tolerance_mm]
         self.end_boards()
-        # Wait until boards have finished the cycles that they have begun, at most LAST_S.
+        # Let boards finish the cycles that they have begun.
         patience = Patience(self._journal, LAST_S)
         while any(map(self._is_cycling, self.pids)) and not patience.is_over:
             self._listen(patience.left_s)
@@ -210,7 +216,7 @@ class Supervisor:
             reason=reason,
             digest=digest(self.segment, stop),
             faults=(*faults, *late),
-            brakings=found,
+            brakings=braking_periods,
             objects=objects,
             excused=tuple(excused),
         )

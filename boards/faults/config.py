@@ -54,7 +54,7 @@ class FaultConfig(Table):
     tick: Tick | None = None
     """first tick; give at most one of tick, at, when; default: the first of the run"""
     at: Moment | None = None
-    """instead of tick: start in simulated time, s"""
+    """instead of tick: start in simulated time [s]"""
     when: str | None = None
     """instead of tick: start once this holds, as in "elemental_move.status.verb == grasp" """
     lasts: Seconds | None = Field(None, alias="for")

@@ -1,1 +1,1 @@
-"""Host boards: programs that take part through a bus adapter, without real time."""
+"""Host boards: programs without real-time guarantees, connected through a bus adapter."""

@@ -1,6 +1,4 @@
-"""What bus adapters have in common: they see the segment itself, and may open something outside the
-rack.
-"""
+"""Base class of adapters, which use the segment directly and may connect to the outside."""
 
 from __future__ import annotations
 
@@ -17,35 +15,50 @@ STATUS = "status"
 
 
 class Adapter(Executor):
-    """A board that passes messages between the backplane and what is not on it."""
+    """Board that passes messages between the backplane and the outside.
+
+    Attributes:
+        readings: Readings of its inputs, by port. They are not attributes of the level, because an
+            output may have the same name as an input.
+    """
 
     wired_by: ClassVar[str]
-    """Key of its board under which its ports are listed."""
+    """Key of its board that lists its ports."""
     joins_sides: ClassVar[bool] = False
-    """Whether what is not on the backplane are host boards: it reads on both sides."""
+    """Whether it connects the real-time side with host boards and reads mailboxes of both."""
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         self.readings: dict[str, Reading[AnyMessage]] = {}
-        """What it has read, by port: a port that it writes may have the same name."""
 
     def input_table(self, port: str) -> dict[str, Any]:
-        """Return where the board puts what it has read."""
+        """Return the table in which the board stores the readings of a port."""
         return self.readings
 
     @classmethod
     def replayed(cls, params: Mapping[str, Any], layout: Layout) -> Mapping[str, bool]:
-        """Return the ports that a replay gives out as they were recorded, and whether it sends
-        their messages one by one; without any, the adapter runs as ever.
+        """Return the outputs that a replay writes from the recording.
+
+        Args:
+            params: Parameters of the adapter's board.
+            layout: Layout of the rack.
+
+        Returns:
+            For each such port, whether its messages are sent one by one. Empty if the adapter runs
+            normally in a replay.
         """
         return {}
 
     def attach(self, segment: Segment, entries: Entries | None) -> None:
-        """Take the segment, before the self-test; in a replay with what was recorded in place of
-        what is out.
+        """Receive the segment. This is called before the self-test.
+
+        Args:
+            segment: Segment of the rack.
+            entries: In a replay, the recorded messages that replace the outside. Otherwise None.
         """
 
     def open(self) -> None:
-        """Open the way outside. The board has its core and priority by now: threads that this
-        starts inherit both.
+        """Open connections to the outside.
+
+        The board has its core and priority when this is called, and threads inherit both.
         """

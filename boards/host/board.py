@@ -1,5 +1,6 @@
-"""A host board: one process under ordinary scheduling, which runs a program until that returns or
-the rack ends it.
+"""A host board: a process that runs a program under ordinary scheduling.
+
+It ends when the program returns or the rack ends it.
 """
 
 from __future__ import annotations
@@ -22,30 +23,40 @@ from rack.boards.wiring import HostWiring
 from rack.levels.host_program import HostProgram
 
 RELEASED_S = 2.0
-"""Longest wait for the end of what the board's process before this one has forked."""
+"""Longest wait for the end of processes that the previous process of this board has forked."""
 LOOK_S = 0.01
+"""Time between two attempts to open the bus."""
 FAILED = 1
 """Exit status of a host board whose program raised an exception."""
 
 
 def run_host_board(segment: Segment, wiring: HostWiring, attention: int, output: int) -> int:
-    """Run a host board's program, which prints to `output`; return the exit status of its process.
+    """Run the program of a host board in this process, which becomes the leader of a session.
 
-    The process leads a session of its own, and what its children leave behind becomes its own
-    child, then the crate's, which ends it. `attention` is an eventfd on which the Rack waits.
+    Orphans of its children become its children, and children of the crate when it ends. The crate
+    kills them.
+
+    Args:
+        segment: Segment of the rack.
+        wiring: Wiring of the host board.
+        attention: Descriptor of the eventfd on which the Rack waits.
+        output: Descriptor to which the program prints.
+
+    Returns:
+        The exit status of the process.
     """
     os.setsid()
     adopt_orphans()
     os.dup2(output, 1)
     os.dup2(output, 2)
-    # The crate ignores it. A program that is ended leaves its `with` and `finally` blocks, as at
-    # sys.exit.
+    # The crate ignores this signal. Here it ends the program like `sys.exit`, so that the program
+    # leaves its `with` and `finally` blocks.
     signal.signal(signal.SIGTERM, _leave)
     bus = _opened(segment, wiring)
     os.eventfd_write(attention, 1)
     try:
         bus.await_turn()
-        # Imported here, not in the crate: a program may import anything, and the crate must stay
+        # Import the program only in this process: it may start threads, and the crate must stay
         # single-threaded.
         program = find_class(wiring.target, HostProgram)(wiring.context)
         bus.connect(program)
@@ -60,8 +71,10 @@ def run_host_board(segment: Segment, wiring: HostWiring, attention: int, output:
 
 
 def _opened(segment: Segment, wiring: HostWiring) -> HostBus:
-    """Open the bus. What the process before this one has forked is being killed, and may hold the
-    board meanwhile.
+    """Open the bus, and try again for a while if it is still claimed.
+
+    Processes that the previous process of this board has forked may hold the claim until the crate
+    has killed them.
     """
     deadline = time.monotonic() + RELEASED_S
     while True:
@@ -78,10 +91,10 @@ def _leave(number: int, frame: FrameType | None) -> None:
 
 
 def _failed(board: str, error: BaseException) -> int:
-    """Print an exception as one line: it becomes an event of the run."""
+    """Print an exception as one line, which becomes an event, and return the exit status."""
     frames = traceback.extract_tb(error.__traceback__)
     place = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
     text = one_line(f"{type(error).__name__}: {error}", LONGEST_REASON)
-    # The crate passes on what boards print.
+    # The crate passes the output of host boards on to the Rack.
     print(f"host board '{board}': {text}{place}", file=sys.stderr, flush=True)
     return FAILED

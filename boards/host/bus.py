@@ -1,4 +1,4 @@
-"""The bus as a program of the host side sees it: `rack.levels.host_program.Bus`, on a segment."""
+"""The bus for programs of the host side: `rack.levels.host_program.Bus`, on a segment."""
 
 from __future__ import annotations
 
@@ -19,31 +19,35 @@ from rack.boards.wiring import HostWiring
 from rack.levels.host_program import HostProgram
 
 WORD = 8
+"""Bytes of a word of the crate's memory."""
 LONGEST_S = 1e9
+"""Longest time-out of a paced program, s. Longer ones are reduced to it."""
 
 
 class BusReceiver:
-    """An input of a program, see `HostReceiver`. Its first read returns the newest message
-    alone.
-    """
+    """Input of a program: see `HostReceiver`. The first read returns only the newest message."""
 
     def __init__(self, reader: DoubleBufferReader) -> None:
         self._reader = reader
 
     def read(self) -> Reading[AnyMessage]:
-        """Return the newest message, with the unread ones before it."""
+        """Return the newest message, together with the unread messages before it."""
         before = self._reader.serial
         reading = self._reader.peek()
         return self._reader.with_earlier(reading, before) if before else reading
 
 
 class BusSender:
-    """An output of a program, see `HostSender`."""
+    """Output of a program: see `HostSender`.
+
+    Attributes:
+        message: The message that the program fills and sends.
+    """
 
     def __init__(self, bus: HostBus, writer: HostWriter, kind: type[Message]) -> None:
         self._bus = bus
         self._writer = writer
-        # In the writer's own memory.
+        # The message is stored in the writer's memory.
         self.message: Any = kind(writer.message.record.dtype, writer.message.raw)
         self._begin()
 
@@ -53,7 +57,7 @@ class BusSender:
             self.message.id = self.sent + 1
 
     def send(self) -> bool:
-        """Send a copy of the message, and begin the next; False when too many wait."""
+        """Send a copy of the message and clear it. Return False if too many messages wait."""
         is_sent = self._writer.send(self._bus.tick)
         if is_sent:
             self._begin()
@@ -66,11 +70,20 @@ class BusSender:
 
 
 class HostBus:
-    """The ports of one host board. Opening it claims the board: a second process is refused with
-    `MailboxError`.
+    """Ports and clock of one host board. Creating it claims the board for this process.
 
-    A paced program runs in turns, in lockstep, while its adapter waits: see
+    In lockstep a program is paced: it runs in turns while its adapter waits. See
     `rack.boards.host.bus_adapter`.
+
+    Args:
+        segment: Segment of the rack.
+        wiring: Wiring of the host board.
+
+    Attributes:
+        block: Control block of the host board.
+
+    Raises:
+        MailboxError: Another process has claimed the board.
     """
 
     def __init__(self, segment: Segment, wiring: HostWiring) -> None:
@@ -89,13 +102,14 @@ class HostBus:
             self.close()
             raise
         self._semaphore = wake_semaphore(segment, wiring.board)
-        # Faults signal this process. From another PID namespace they would strike another one.
+        # Faults send signals to this process id. If the program runs in another PID namespace, they
+        # would strike another process, so no id is published.
         self.block[Block.PID] = os.getpid() if segment.launcher else 0
         self.block[Block.WAITS_UNTIL] = 0
         self.block[Block.STATE] = TaskState.RUNNING
 
     def connect(self, program: HostProgram) -> None:
-        """Put what reads and sends into the ports of the board's program."""
+        """Set the ports of a program to objects that receive and send its messages."""
         ports = vars(program)
         for port, mailbox in self._wiring.inputs.items():
             self._segment.message_classes[mailbox] = program.inputs[port].message
@@ -105,23 +119,21 @@ class HostBus:
 
     @property
     def tick(self) -> int:
-        """The clock's tick; of a paced program that of the cycle in which it runs."""
+        """Tick of the clock. For a paced program, the tick of the cycle in which it runs."""
         return self.block[Block.RELEASED] if self._is_paced else self._words[System.TICK]
 
     @property
     def time_s(self) -> float:
-        """Time since some moment, s: of a paced program simulated time."""
+        """Time since an arbitrary moment, s. For a paced program it is simulated time."""
         return self.tick * self._wiring.context.tick_s if self._is_paced else time.monotonic()
 
     @property
     def is_over(self) -> bool:
-        """Whether the run has ended: the program should return."""
+        """Whether the run has ended, so that the program should return."""
         return self._segment.run_is_over
 
     def wait(self, timeout_s: float) -> bool:
-        """Wait until a message arrives; False when none has after the timeout, or when the run
-        ends.
-        """
+        """Wait until a message arrives. Return False after the time-out or the end of the run."""
         if self._is_paced:
             ticks = round(min(timeout_s, LONGEST_S) / self._wiring.context.tick_s)
             self.block[Block.WAITS_UNTIL] = self.tick + max(1, ticks)
@@ -138,9 +150,10 @@ class HostBus:
         return False
 
     def await_turn(self) -> None:
-        """Wait until the program may run, or the run ends. In real time it always may."""
+        """Wait until the program may run or the run ends. In real time this returns at once."""
         block = self.block
-        # The clock admits the successor of a lost process. Read first: it clears this word last.
+        # The clock must first admit the successor of a lost process. It clears LOST last, so LOST
+        # must be read first.
         while (
             self._is_paced
             and (block[Block.LOST] or block[Block.DONE] == block[Block.RELEASED])
@@ -149,7 +162,7 @@ class HostBus:
             self._semaphore.acquire(CHECK_S)
 
     def _end_turn(self) -> None:
-        """Let the adapter go on."""
+        """Let the adapter continue its cycle."""
         block = self.block
         block[Block.DEADLINE] = self.tick + self._wiring.computing
         block[Block.DONE] = block[Block.RELEASED]
@@ -161,18 +174,26 @@ class HostBus:
         return [task.name for task in self._segment.layout.tasks]
 
     def address(self, name: str) -> int:
-        """Return the bus address of a mailbox, or of the control block of a task. Raises
-        `LookupError`.
+        """Return the bus address of a mailbox, or of the control block of a task.
+
+        Raises:
+            LookupError: The bus has neither of this name.
         """
         places = self._segment.map
-        found = {**places.blocks, **places.mailboxes}
-        if name not in found:
-            raise LookupError(f"nothing on the bus is called '{name}'; known: {', '.join(found)}")
-        return found[name]
+        known = {**places.blocks, **places.mailboxes}
+        if name not in known:
+            raise LookupError(f"nothing on the bus is called '{name}'; known: {', '.join(known)}")
+        return known[name]
 
     def words(self, address: int, count: int = 1) -> list[int]:
-        """Return words of the crate's memory from a bus address on. Raises `ValueError` for an
-        address without one.
+        """Read words of the crate's memory.
+
+        Args:
+            address: Bus address of the first word, a multiple of 8.
+            count: Number of words.
+
+        Raises:
+            ValueError: The words are not all on the bus.
         """
         size = self._segment.map.size
         last = address + WORD * count
@@ -184,13 +205,13 @@ class HostBus:
         return list(self._words[address // WORD : last // WORD])
 
     def finish(self) -> None:
-        """Declare the program's work done, as its return does."""
+        """Record that the program is finished, as its return does."""
         self.block[Block.STATE] = TaskState.ENDED
         if self._is_paced:
             self._end_turn()
 
     def close(self) -> None:
-        """Give the board up: another process may open it."""
+        """Release the claim, so that another process can open the board."""
         for writer in self._writers.values():
             writer.close()
         self._claim.close()

@@ -1,29 +1,28 @@
-"""The bridge: a bus adapter between the real-time side and the boards of the host side.
+"""The bus adapter between the real-time side and host boards, also called bridge.
 
 A bridge is an ordinary board with a rate and a priority. Each entry of its table passes one mailbox
-across; the side of the source is the direction.
+to the other side; the side of the source determines the direction.
 
 Into real time, the bridge takes messages from the ring of a host board, checks them, and writes
-them to its own mailbox `<bridge>.<port>`, which levels read by ticks as any other. From there on a
-run is repeatable. Out of real time it reads a level's mailbox by ticks and writes a copy, which
-host boards read whenever they like.
+them to its mailbox `<bridge>.<port>`. Levels read that mailbox at ticks like any other, so that
+runs are repeatable from there on. Out of real time, it reads a level's mailbox at ticks and writes
+a copy, which host boards can read at any time.
 
-A hung, dead or flooding host board costs the real-time side nothing: the ring is bounded, a cycle
-looks at no more than `most` messages of an entry, and nothing here waits. The bridge's status shows
-it, entry by entry.
+A host board that hangs, ends or floods its ring does not affect the real-time side: the ring is
+bounded, a cycle processes at most `most` messages of an entry, and the bridge never waits in real
+time. Its status has counters for each entry.
 
 In lockstep a program runs only within cycles of its bridges, after the exchange, and the cycle
-waits until it waits. It is due when a message has come, when the time has come until which it
-waits, and at its start. What it sends is taken in a later cycle, once its computing is over: that
-takes the simulated time `[host.x] computing_ms`, however long it really took. So it enters at ticks
-that the config determines. If a program has several bridges, lockstep releases all tasks one at a
-time.
+lasts until the program waits. The program is due at its start, when a message has arrived, and when
+its time-out has passed. Its messages are taken in a later cycle, once the simulated time
+`[host.x] computing_ms` has passed, however long the program took in reality. They therefore enter
+at ticks that the config determines. If a program has several bridges, lockstep releases all tasks
+one at a time.
 
-Alternative considered: a clock that releases programs as it does tasks. They would need a rate, and
-a message would wait for their next cycle.
+The clock could release programs like tasks instead. But then they would need a rate, and a message
+would wait for their next cycle.
 
-A replay does without host boards: what entered in a recorded run is given out again, each message
-at its tick.
+A replay does not run host boards. The recorded messages enter again, each at its tick.
 """
 
 from __future__ import annotations
@@ -56,13 +55,13 @@ from rack.levels.level import Input, LevelContext, MadePorts, Output, QueuedOutp
 from rack.levels.tables import read_params
 
 LONGEST_S = 30.0
-"""Real time within which a program in lockstep must wait, or end; its start and imports have as
-long."""
+"""Longest real time of one turn of a program in lockstep, its start and imports included."""
 
 
 class BusAdapter(Adapter):
-    """Passes mailboxes between the two sides. Its status is done when the programs of all its host
-    boards are.
+    """Passes mailboxes between the real-time side and host boards.
+
+    Its status is done when the programs of all its host boards are finished.
     """
 
     params = AdapterParams
@@ -81,14 +80,19 @@ class BusAdapter(Adapter):
 
     @classmethod
     def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, type[Message]]) -> MadePorts:
-        """Return a port to read and one to write for each entry, and the status."""
+        """Return the ports that the entries add: an input and an output each, and the status.
+
+        Args:
+            params: Parameters of the adapter's board.
+            types: Message classes of the mailboxes known so far.
+        """
         entries = AdapterParams.entries_of(params)
         known = {port: entry for port, entry in entries.items() if entry.source in types}
         inputs = {
             port: Input(types.get(entry.source, AdapterEntry), entry.source)
             for port, entry in entries.items()
         }
-        # A message that is passed once must not be sampled; to host boards a bridge writes by
+        # Messages that are passed once must be queued. Messages to host boards the bridge writes
         # itself.
         outputs = {
             port: (QueuedOutput if entry.asynchronous else Output)(
@@ -101,7 +105,7 @@ class BusAdapter(Adapter):
 
     @classmethod
     def replayed(cls, params: Mapping[str, Any], layout: Layout) -> Mapping[str, bool]:
-        """Return the ports of what host boards send, and the status."""
+        """Return the ports with messages of host boards, and the status."""
         hosts = {host.name for host in layout.hosts}
         sent = {
             port: entry.asynchronous
@@ -111,24 +115,27 @@ class BusAdapter(Adapter):
         return {**sent, STATUS: False}
 
     def attach(self, segment: Segment, entries: Entries | None) -> None:
-        """Open the host side; in a replay, take over what the recorded run wrote, by port,
-        instead.
+        """Open the mailboxes of the host side, or in a replay the recorded messages.
+
+        Args:
+            segment: Segment of the rack.
+            entries: In a replay, the recorded messages by port. Otherwise None.
         """
         layout = segment.layout
         hosts = {host.name for host in layout.hosts}
         board = self.context.board
-        # What the process before this one has written, if the bridge is restarted.
+        # If the bridge was restarted, continue with what its previous process has written.
         status, tick = last_written(segment, f"{board}.{STATUS}")
         for port, table in self._tables.items():
             count = self._counts[port]
             if status is not None:
                 count.resume(getattr(status, port), tick)
-            own = f"{board}.{port}"
-            before, since = last_written(segment, own)
+            mailbox = f"{board}.{port}"
+            before, since = last_written(segment, mailbox)
             writer = layout.mailbox(table.source).writer
             entry: Crossing
             if writer not in hosts:
-                entry = Outward(segment, own, port, table, count)
+                entry = Outward(segment, mailbox, port, table, count)
             else:
                 if before is not None:
                     self._before[port] = bytes(before.raw)
@@ -146,7 +153,7 @@ class BusAdapter(Adapter):
             self._statuses = Replayed(entries[STATUS], STATUS, is_sent=False)
 
     def process(self, tick: int) -> None:
-        """Exchange the entries that are due; then, in lockstep, let programs run."""
+        """Exchange the entries that are due. In lockstep, let programs run afterwards."""
         for port, message in self._before.items():
             out = self.ports[port]
             (out.message if isinstance(out, Sender) else out).raw[:] = message
@@ -172,8 +179,8 @@ class BusAdapter(Adapter):
         status.error = 0
         status.reason = ""
         if lost:
-            # First: in lockstep the Rack may give it up at any tick, and the clock confirms that at
-            # one.
+            # This comes first, because in lockstep the Rack may give a board up at any moment, and
+            # only the clock's confirmation comes at a determined tick.
             status.state = State.HOLDING
             status.reason = f"host board '{lost[0]}' is lost: it is being restarted"
         elif gone:
@@ -184,8 +191,9 @@ class BusAdapter(Adapter):
 
 
 class HostTurn(ReleasedTask):
-    """A host board's program in lockstep, as its adapter sees it; its own end is
-    `rack.boards.host.bus.HostBus`.
+    """Adapter's side of the turns of a host program in lockstep.
+
+    The program's side is `rack.boards.host.bus.HostBus`.
     """
 
     def __init__(self, segment: Segment, host: TaskSpec) -> None:
@@ -193,13 +201,13 @@ class HostTurn(ReleasedTask):
         self._segment = segment
 
     def take(self, tick: int) -> None:
-        """Let the program run in the cycle released at `tick` if it is due, and wait until it
-        waits.
+        """If the program is due in the cycle released at `tick`, let it run until it waits.
 
-        Raises `CannotGoOn` if that takes too long.
+        Raises:
+            CannotGoOn: The program runs too long.
         """
         block = self.block
-        # It may be done, or given up.
+        # A program with a later state is finished, or was given up.
         if (
             block[Block.STATE] > TaskState.RUNNING
             or block[Block.WAITS_UNTIL] > tick
@@ -217,14 +225,14 @@ class HostTurn(ReleasedTask):
             if time.monotonic() > bound_s:
                 raise CannotGoOn(
                     f"the program of host board '{self.spec.name}' has not waited for {LONGEST_S:g}"
-                    " s of real time: lockstep cannot go on without it"
+                    " s of real time, and lockstep cannot continue without it"
                 )
         if block[Block.LOST]:
-            # The crate has noted the tick of the clock, which may be ahead of this cycle.
+            # The crate has recorded the tick of the clock, which may be later than this cycle.
             block[Block.LOST] = tick + 1
 
 
 def status_of(entries: Mapping[str, EntryConfig]) -> type[Status]:
-    """Return the class of a bridge's status: one group of counts for each entry."""
+    """Return the class of a bridge's status, with a group of counters for each entry."""
     groups = {port: field(AdapterEntry, doc=f"entry {port}") for port in entries}
     return make_message("adapter_status", 1, Status, groups)

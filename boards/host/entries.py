@@ -1,6 +1,4 @@
-"""The entries of a bridge: what each passes, in which direction, when, and what is counted of
-it.
-"""
+"""Entries of a bus adapter: which mailbox each passes, in which direction, and its counters."""
 
 from __future__ import annotations
 
@@ -23,18 +21,19 @@ from rack.boards.wiring import Rows
 from rack.levels.tables import LAST_TICK, Table
 
 NEVER = -1
+"""Tick in place of one when nothing has happened yet."""
 PORT = re.compile(r"[a-z][a-z0-9_]*")
 RESERVED = ("status", "echo", "state", "error", "reason", "raw", "record", "clear", "copy_from")
-"""Names that the status of a bridge needs for itself."""
+"""Names that no port may have, because the status of an adapter has fields of these names."""
 
 
 def counter(doc: str) -> Any:
-    """Declare a counter in the status of an adapter."""
+    """Declare a counter among the fields of an adapter's status. `doc` is its meaning."""
     return field("u4", unit="1", doc=doc)
 
 
 class AdapterEntry(Message, version=1):
-    """One entry, in the status of its bridge."""
+    """Counters of one entry, as a group of fields in the status of its adapter."""
 
     passed: int = counter("messages passed to the other side")
     refused: int = counter("messages refused: damaged, forged, or not what its type permits")
@@ -51,18 +50,18 @@ _COUNTED = ("passed", "refused", "superseded", "full", "waiting", "arrived")
 
 
 class EntryConfig(Table):
-    """`[board.<name>.params.pass.<port>]`: one mailbox that a bus adapter passes across."""
+    """`[board.<name>.params.pass.<port>]`: mailbox that a bus adapter copies to the other side."""
 
     source: str = Key(alias="from")
-    """mailbox to pass, as in program.requests; its side is the direction"""
+    """mailbox to pass, as in program.requests; its side determines the direction"""
     every: int = Key(1, ge=1, le=LAST_TICK)
-    """exchange in every n-th cycle of the bridge, cycles"""
+    """the adapter passes messages in every n-th of its cycles [cycles]"""
     phase: int = Key(0, ge=0)
-    """with every: which of the n cycles, cycles"""
+    """number of the first such cycle, less than every [cycles]"""
     asynchronous: bool = False
-    """pass each message as it comes, once; default: the newest, repeatedly"""
+    """pass each message once, in order; default: pass the newest message in each exchange"""
     most: int = Key(8, ge=1, le=256)
-    """messages of a host board looked at in one cycle; the others wait"""
+    """largest number of messages of a host board that one cycle processes; further ones wait"""
 
     @model_validator(mode="after")
     def _has_one_mode(self) -> Self:
@@ -70,33 +69,32 @@ class EntryConfig(Table):
             raise ValueError(f"phase = {self.phase}: must be less than every, {self.every}")
         if self.asynchronous and self.every > 1:
             raise ValueError(
-                f"every = {self.every}: the entry is asynchronous; permitted: one of the two"
+                f"every = {self.every}: the entry is also asynchronous; give only one of the two"
             )
         return self
 
     def is_due(self, cycle: int) -> bool:
-        """Say whether the entry is exchanged in that cycle of the bridge."""
+        """Return True if the adapter passes messages of this entry in that cycle."""
         return cycle % self.every == self.phase
 
 
 class AdapterParams(Table):
-    """`[board.<name>.params]` of a bus adapter."""
+    """`[board.<name>.params]`: parameters of a bus adapter."""
 
     entries: dict[str, EntryConfig] = Key({}, alias="pass")
-    """mailboxes to pass, by port of the bridge"""
+    """mailboxes to pass, by port of the adapter"""
 
     @model_validator(mode="after")
     def _has_ports(self) -> Self:
-        if wrong := [port for port in self.entries if not PORT.fullmatch(port) or port in RESERVED]:
-            raise ValueError(
-                f"pass.{wrong[0]}: invalid name; permitted: a-z, 0-9 and _, except"
-                f" {', '.join(RESERVED)}"
-            )
+        for port in self.entries:
+            if not PORT.fullmatch(port) or port in RESERVED:
+                why = f"valid: a-z, 0-9 and _, except {', '.join(RESERVED)}"
+                raise ValueError(f"pass.{port}: invalid name; {why}")
         return self
 
     @classmethod
     def entries_of(cls, params: Mapping[str, Any]) -> dict[str, EntryConfig]:
-        """Return the entries in a table; none if it has mistakes."""
+        """Return the entries in a table of parameters. Empty if the table has mistakes."""
         try:
             return cls.model_validate(params).entries
         except ValidationError:
@@ -105,8 +103,10 @@ class AdapterParams(Table):
 
 @dataclass
 class EntryCount:
-    """The counts of one entry: the fields of `AdapterEntry`. `written`: tick at which the newest
-    message was written.
+    """Counters of one entry. See the fields of `AdapterEntry`.
+
+    Attributes:
+        written: Tick at which the newest message was written. `NEVER` before the first.
     """
 
     passed: int = 0
@@ -118,27 +118,44 @@ class EntryCount:
     written: int = NEVER
 
     def resume(self, record: Any, tick: int) -> None:
-        """Continue with the counts in the status of an earlier cycle."""
+        """Take over the counters from the status of an earlier cycle.
+
+        Args:
+            record: The entry's group of fields in that status.
+            tick: Tick at which the status was written.
+        """
         age = int(record["age"])
         for name in _COUNTED:
             setattr(self, name, int(record[name]))
         self.written = NEVER if age == NEVER else tick - age
 
     def passes(self, tick: int, written: int) -> None:
-        """Count a message that reaches the other side at `tick`."""
+        """Count a message that reaches the other side at `tick` and was written at `written`."""
         self.passed += 1
         self.arrived = tick
         self.written = written
 
     def fill(self, record: Any, tick: int) -> None:
-        """Write the counts into the status of a cycle."""
+        """Write the counters to a status.
+
+        Args:
+            record: The entry's group of fields in the status.
+            tick: Tick at which the present cycle was released.
+        """
         age = NEVER if self.written == NEVER else tick - self.written
         fill_counts(record, (*(getattr(self, name) for name in _COUNTED), age))
 
 
 class Inward:
-    """Into real time: from the ring of a host board to the bridge's own mailbox, which levels read
-    by ticks.
+    """Entry into real time: from the ring of a host board to a mailbox of the adapter.
+
+    Levels read that mailbox at ticks.
+
+    Args:
+        segment: Segment of the rack.
+        port: Port of the adapter.
+        table: Table of the entry.
+        count: Its counters.
     """
 
     def __init__(self, segment: Segment, port: str, table: EntryConfig, count: EntryCount) -> None:
@@ -153,8 +170,14 @@ class Inward:
     def exchange(
         self, read: Mapping[str, Reading[AnyMessage]], write: Mapping[str, Any], tick: int
     ) -> None:
-        """Take what waits, and check it. In lockstep what a program sends is there once its
-        computing is over.
+        """Take waiting messages from the ring, check them, and pass them on.
+
+        In lockstep the messages of a program can be taken once its computing time has passed.
+
+        Args:
+            read: Readings of the adapter's inputs, by port. Not used.
+            write: Output messages of the adapter, by port.
+            tick: Tick at which the cycle was released.
         """
         ring = self._ring
         count = self._count
@@ -176,14 +199,22 @@ class Inward:
 
 
 class Outward:
-    """Out of real time: from a level's mailbox, read by ticks, to one that host boards read; it
-    wakes them.
+    """Entry out of real time: from a level's mailbox to one that host boards read.
+
+    The host boards are woken.
+
+    Args:
+        segment: Segment of the rack.
+        mailbox: Mailbox that the adapter writes.
+        port: Port of the adapter.
+        table: Table of the entry.
+        count: Its counters.
     """
 
     def __init__(
-        self, segment: Segment, own: str, port: str, table: EntryConfig, count: EntryCount
+        self, segment: Segment, mailbox: str, port: str, table: EntryConfig, count: EntryCount
     ) -> None:
-        self._writer = open_writer(segment, own)
+        self._writer = open_writer(segment, mailbox)
         self._port = port
         self._table = table
         self._count = count
@@ -194,38 +225,49 @@ class Outward:
     def exchange(
         self, read: Mapping[str, Reading[AnyMessage]], write: Mapping[str, Any], tick: int
     ) -> None:
-        """Copy what is there."""
+        """Copy the messages that the adapter has read, and wake the host boards that read them.
+
+        Args:
+            read: Readings of the adapter's inputs, by port.
+            write: Output messages of the adapter, by port. Not used.
+            tick: Tick at which the cycle was released.
+        """
         reading = read[self._port]
         if not reading.is_there or (self._table.asynchronous and not reading.is_new):
             return
         for message in (*reading.earlier, reading.message):
             self._writer.message.copy_from(message)
             self._writer.write(tick)
-        # A reading does not say when its message was written.
+        # A reading does not contain the tick at which its message was written.
         self._source.read(tick)
         self._count.passes(tick, self._source.newest)
         for block, semaphore in self._readers:
-            # In lockstep its program is due.
+            # In lockstep the program of the host board is now due.
             block[Block.WAITS_UNTIL] = 0
-            # One post is enough: a host board that does not wait would let the semaphore overflow.
+            # Do not count further: the semaphore of a host board that never waits would overflow.
             if not semaphore.value:
                 semaphore.release()
 
 
 def last_written(segment: Segment, mailbox: str) -> tuple[AnyMessage | None, int]:
-    """Return the newest message of a mailbox, with the tick at which it was written; None and
-    `NEVER` if there is none.
+    """Return the newest message of a mailbox and the tick at which it was written.
+
+    Returns:
+        None and `NEVER` if the mailbox is empty.
     """
-    own = open_observer(segment, mailbox)
-    reading = own.peek()
-    return (reading.message, own.newest) if reading.is_there else (None, NEVER)
+    observer = open_observer(segment, mailbox)
+    reading = observer.peek()
+    return (reading.message, observer.newest) if reading.is_there else (None, NEVER)
 
 
 class Replayed:
-    """A mailbox of an adapter in a replay: what the recorded run wrote to it, at the same ticks.
+    """Entry in a replay: writes the messages of the recorded run again, at the same ticks.
 
-    Of messages that are sent one by one (`is_sent`), an adapter that was restarted gives out those
-    after tick `since`.
+    Args:
+        rows: Tick, basis and content of each recorded message.
+        port: Port of the adapter.
+        is_sent: Whether messages are sent one by one, in order, and none may be repeated.
+        since: Tick up to which messages were already sent, before a restart of the adapter.
     """
 
     def __init__(self, rows: Rows, port: str, is_sent: bool, since: int = NEVER) -> None:
@@ -237,7 +279,16 @@ class Replayed:
     def exchange(
         self, read: Mapping[str, Reading[AnyMessage]], write: Mapping[str, Any], tick: int
     ) -> bool:
-        """Give out what the recorded run wrote up to this cycle; return whether there was some."""
+        """Write the recorded messages up to this cycle.
+
+        Args:
+            read: Readings of the adapter's inputs, by port. Not used.
+            write: Output messages of the adapter, by port.
+            tick: Tick at which the cycle was released.
+
+        Returns:
+            True if a message was written.
+        """
         out = write[self._port]
         message = out.message if self._is_sent else out
         rows = self._rows
@@ -252,4 +303,4 @@ class Replayed:
 
 
 Crossing = Inward | Outward | Replayed
-"""One entry, at work: `exchange` is called in the cycles in which that is due."""
+"""An entry in operation. Its `exchange` is called in the cycles in which the entry is due."""

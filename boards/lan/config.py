@@ -50,7 +50,7 @@ class ExportConfig(Table):
     source: Local = Field(alias="from")
     """mailbox, as in task.status; others import it as RACK/task.status"""
     rate_hz: float = Field(10.0, gt=0, le=FASTEST_HZ)
-    """rate of the exchange, Hz; divides the adapter's"""
+    """rate of the exchange [Hz]; divides the adapter's"""
 
 
 class ImportConfig(Table):
@@ -61,9 +61,9 @@ class ImportConfig(Table):
     type: TypeName
     """message class of that mailbox, package.module:Class"""
     rate_hz: float = Field(10.0, gt=0, le=FASTEST_HZ)
-    """rate of the exchange, Hz; divides the adapter's"""
+    """rate of the exchange [Hz]; divides the adapter's"""
     max_age_ms: Positive
-    """age from which a message is old and its writer counts as lost, ms; simulated time"""
+    """age from which a message is old and its writer counts as lost [ms]; simulated time"""
 
     @property
     def rack(self) -> str:
@@ -103,7 +103,7 @@ class LanTable(Table):
     insecure: bool = False
     """permit endpoints without TLS beyond loopback, or without certificates on it"""
     lease_ms: float = Field(500.0, ge=20, le=60_000)
-    """real time without a sign of life after which a peer counts as lost, ms"""
+    """real time without a sign of life after which a peer counts as lost [ms]"""
     on_peer_loss: OnPeerLoss = "hold"
     """reaction to the loss of a peer; hold: levels find its mailboxes lost at once and hold until
     its next message; stop: in addition, the arm ramps to rest and brakes until the peer is back;

@@ -1,3 +1,1 @@
-"""The paper's timing model and its extension to tasks that share a core, as pure functions on plain
-data.
-"""
+"""The paper's timing model, extended to tasks that share a core. Pure functions on plain data."""

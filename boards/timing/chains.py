@@ -1,4 +1,4 @@
-"""Chains of boards above each other that have the same timing, and their names as text."""
+"""Groups of chains of boards that have the same timing, and their names as text."""
 
 from __future__ import annotations
 
@@ -8,9 +8,7 @@ from dataclasses import dataclass
 
 
 def spanned(names: Sequence[str]) -> str:
-    """Return names as text; of three or more that are numbered in order the first and the last,
-    "joint1 ... joint6".
-    """
+    """Return names as text. Consecutive numbers are shortened, as in "joint1 ... joint6"."""
     rows: list[list[str]] = []
     for name in names:
         if rows and name == _following(rows[-1][-1]):
@@ -21,17 +19,21 @@ def spanned(names: Sequence[str]) -> str:
 
 
 def _following(name: str) -> str:
-    """Return the name that is numbered one higher; empty if the name has no number."""
-    part = re.fullmatch(r"(.*?)(\d+)(\D*)", name)
-    return f"{part[1]}{int(part[2]) + 1}{part[3]}" if part else ""
+    """Return the name with a number higher by one. Empty if the name has no number."""
+    match = re.fullmatch(r"(.*?)(\d+)(\D*)", name)
+    return f"{match[1]}{int(match[2]) + 1}{match[3]}" if match else ""
 
 
 @dataclass(frozen=True)
 class ParallelChains:
-    """Chains of boards, highest first, of equal cycles, in ticks: every combination of the boards
-    of each level.
+    """Chains of boards with equal cycles, which have a common timing.
 
-    A rack with a board for every joint has one chain for each, and one answer for all of them.
+    A rack with one board per joint has a chain for each joint, and one result for all of them.
+
+    Attributes:
+        chains: Boards of each chain, the highest first. If there are several chains, they are all
+            combinations of the boards of each level.
+        cycles: Cycle of each level, ticks.
     """
 
     chains: tuple[tuple[str, ...], ...]
@@ -39,17 +41,17 @@ class ParallelChains:
 
     @property
     def levels(self) -> tuple[str, ...]:
-        """The boards of each level, as text."""
+        """Boards of each level, as text."""
         return tuple(
             spanned(tuple(dict.fromkeys(boards))) for boards in zip(*self.chains, strict=True)
         )
 
     @property
     def bound(self) -> int:
-        """The bound on the system's response along them, n R_max for n levels (eq. 3.2), ticks."""
+        """Bound on the system response along the chains, n R_max for n levels (eq. 3.2), ticks."""
         return len(self.cycles) * max(self.cycles, default=0)
 
     @property
     def text(self) -> str:
-        """All of them in one line: "trajectory > joint1 ... joint6 > arm"."""
+        """All chains in one line: "trajectory > joint1 ... joint6 > arm"."""
         return " > ".join(self.levels)

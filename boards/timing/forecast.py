@@ -1,4 +1,4 @@
-"""All predictions of the timing model for a rack before it is launched."""
+"""Forecast of the timing of a rack before its launch, from budgets in its config."""
 
 from __future__ import annotations
 
@@ -16,11 +16,16 @@ NO_BUDGET = "no budget"
 
 @dataclass(frozen=True)
 class Forecast:
-    """The timing of a rack from its budgets. `notes` are the limits of the prediction; `uncounted`
-    gives for every board, planner and host board that it leaves out the reason.
+    """Predicted timing of a rack.
 
-    `inboxes` are what interrupts cost each board, as `InboxTiming.document` returns it. `frames`
-    are what cores do in the frames of a static schedule.
+    Attributes:
+        rack: Data of the rack.
+        system: Predicted system response.
+        verdicts: Verdicts of all equations.
+        inboxes: Cost of interrupts for each board, as plain data.
+        frames: Distinct frames of each core in a static schedule.
+        notes: Limits of the prediction, one sentence each.
+        uncounted: Boards, planners and host boards that are not included, with the reasons.
     """
 
     rack: RackTiming
@@ -33,12 +38,12 @@ class Forecast:
 
     @classmethod
     def of(cls, rack: RackTiming, has_cores: bool = True, hosts: Iterable[str] = ()) -> Forecast:
-        """Return the forecast of a rack.
+        """Compute the forecast of a rack.
 
         Args:
-            rack: Timing of the boards.
-            has_cores: False if this machine lacks cores that the config asks for.
-            hosts: Host boards, which the timing model does not know.
+            rack: Data of the rack.
+            has_cores: False if this machine lacks cores that the config requests.
+            hosts: Names of host boards, which the timing model cannot include.
         """
         return cls(
             rack=rack,
@@ -50,7 +55,7 @@ class Forecast:
             ),
             frames=core_frames(rack),
             notes=tuple(_notes(rack, has_cores)),
-            uncounted=_uncounted(rack) | dict.fromkeys(hosts, "a host board, without a rate"),
+            uncounted=_uncounted(rack) | dict.fromkeys(hosts, "a host board has no rate"),
         )
 
     @property
@@ -59,12 +64,12 @@ class Forecast:
         return all(verdict.holds for verdict in self.verdicts)
 
     def document(self) -> dict[str, Any]:
-        """Return everything as plain data; times whose names end in _ns are wall-clock times."""
+        """Return the forecast as plain data, for JSON. Times with names in _ns are wall-clock."""
         rack = self.rack
         schedule = None
         if rack.schedule is not None:
             minor_ms, major_ms = (ticks * rack.tick_ns * 1e-6 for ticks in rack.schedule)
-            cores = [found.document() for found in self.frames]
+            cores = [frames.document() for frames in self.frames]
             schedule = {"minor_ms": minor_ms, "major_ms": major_ms, "cores": cores}
         return {
             **asdict(self.system),
@@ -81,44 +86,42 @@ class Forecast:
 
 
 def _uncounted(rack: RackTiming) -> dict[str, str]:
-    """Return the tasks without a cost, with the reason."""
+    """Return the tasks without a cost, each with the reason."""
     counted = {task.name for task in rack.tasks if task.cost_ns}
-    # An update alone is no plan.
+    # A budget with an update but no planning time does not include a plan.
     counted -= {f"{b.name}.planner" for b in rack.boards.values() if not b.is_plan_budgeted}
-    found = {name: NO_BUDGET for name in rack.cores if name not in counted}
-    if rack.clock.name in found:
-        found[rack.clock.name] = "timing.clock_ms is 0; --set timing.clock_ms=0.1 counts 0.1 ms"
-    return found
+    reasons = {name: NO_BUDGET for name in rack.cores if name not in counted}
+    if rack.clock.name in reasons:
+        reasons[rack.clock.name] = "timing.clock_ms is 0; --set timing.clock_ms=0.1 counts 0.1 ms"
+    return reasons
 
 
 def _notes(rack: RackTiming, has_cores: bool) -> Iterator[str]:
     if queues := [
         queue for rank in rack.ranks for name in rank for queue in rack.boards[name].queues
     ]:
-        yield f"the system's response is that of empty queues: {', '.join(queues)}"
+        yield f"the system response assumes that these queues are empty: {', '.join(queues)}"
     if rack.inboxes:
         yield (
-            "the system's response leaves out how long messages wait to be served:"
+            "the system response does not include waits of messages for interrupt service:"
             f" {', '.join(rack.inboxes)}"
         )
     known = [board for board in rack.boards.values() if board.budget is not None]
     if known and rack.is_lockstep:
         yield (
-            "in lockstep a tick waits for late tasks; this is the timing of the same rack in real"
+            "in lockstep a tick waits for late tasks; these are the times of the same rack in real"
             " time"
         )
     if known and rack.speed != 1.0:
-        yield (
-            f"times are of the wall clock: speed {rack.speed:g} changes the cycles, not the budgets"
-        )
+        yield (f"times are wall-clock times: speed {rack.speed:g} changes cycles but not budgets")
     if known and not has_cores:
-        yield "cores are those of the config; this machine lacks some of them"
+        yield "cores are those in the config; this machine does not have all of them"
     sharing = [task for task in rack.tasks if task.cost_ns and not task.priority]
     crowded = [
         task.name for task in sharing if sum(other.core == task.core for other in sharing) > 1
     ]
     if crowded:
         yield (
-            "ordinary scheduling guarantees nothing; bounds that assume fair turns:"
+            "ordinary scheduling guarantees nothing; these bounds assume fair turns:"
             f" {', '.join(crowded)}"
         )

@@ -1,10 +1,9 @@
-"""Static cyclic schedules: every board has its place in minor frames, which repeat with the major
-frame.
+"""Static cyclic schedules: places of the boards in the minor frames of a major frame.
 
-The terms are those of T. P. Baker and A. Shaw, *The Cyclic Executive Model and Ada*, Real-Time
-Systems 1 (1989). A board's cycle is a whole number of minor frames and divides the major one; its
-phase is its place in them. Boards whose places are in one tick follow each other by priority.
-Planners have no place: they plan in the slack.
+The terms are from T. P. Baker and A. Shaw, *The Cyclic Executive Model and Ada*, Real-Time
+Systems 1 (1989). A board's cycle is a whole number of minor frames and divides the major frame. Its
+phase is its place in them. Boards with places in the same tick run in the order of their
+priorities. Planners have no place and run in the slack.
 """
 
 from __future__ import annotations
@@ -20,17 +19,21 @@ from rack.boards.timing.schedule import Span, simulate
 from rack.boards.timing.tasks import TimedTask
 
 Work = dict[tuple[str, int], list[Span]]
-"""The stretches of work of every job, in order, by task and release."""
+"""Spans of every job in order of time, by its task and release time in ns."""
 
 
 @dataclass(frozen=True)
 class FramePlace:
-    """A board in a frame, ns from the frame's start: it begins at `offset_ns` and must be done by
-    `limit_ns`.
+    """Place of a board in a frame. Times are ns from the start of the frame.
 
-    `job_ns` is its budget with two context switches. `slack_ns` is the time from its end to the
-    limit; negative: so much of its work is left then, if the limit stops nothing. `until` is the
-    board that begins at the limit; empty: the frame ends there.
+    Attributes:
+        board: The board.
+        offset_ns: Time at which it begins.
+        job_ns: Its budget with two context switches, ns.
+        limit_ns: Time at which it must be done.
+        slack_ns: Time from its end to the limit, ns. If negative, the work that is left at the
+            limit.
+        until: Board that begins at the limit. Empty if the frame ends at the limit.
     """
 
     board: str
@@ -43,8 +46,12 @@ class FramePlace:
 
 @dataclass(frozen=True)
 class CoreFrames:
-    """Frames of one core, by number in the major frame, in which the same boards have the same
-    places.
+    """Frames of one core in which the same boards have the same places.
+
+    Attributes:
+        core: The core.
+        frames: Numbers of these minor frames within the major frame.
+        places: The places of the boards.
     """
 
     core: int
@@ -52,7 +59,7 @@ class CoreFrames:
     places: tuple[FramePlace, ...]
 
     def document(self) -> dict[str, Any]:
-        """Return it as plain data; times are ms."""
+        """Return the frames as plain data, for JSON. Times are ms."""
         names = ("offset", "job", "limit", "slack")
         places = [
             {
@@ -66,11 +73,10 @@ class CoreFrames:
 
 
 def core_frames(rack: RackTiming) -> tuple[CoreFrames, ...]:
-    """Return the distinct frames of every core, in the order of their first; none without a static
-    schedule.
+    """Return the distinct frames of each core. Empty without a static schedule.
 
-    They are those of the second major frame: boards that are late in the first have their effect
-    there.
+    The frames are taken from the second major frame, so that they include the effect of boards that
+    are late in the first one.
     """
     if rack.schedule is None:
         return ()
@@ -81,25 +87,32 @@ def core_frames(rack: RackTiming) -> tuple[CoreFrames, ...]:
     work: Work = defaultdict(list)
     for span in simulate(tasks, 2 * major + 2 * minor).spans:
         work[span.task, span.release_ns].append(span)
-    found: dict[tuple[int, tuple[FramePlace, ...]], list[int]] = defaultdict(list)
+    distinct: dict[tuple[int, tuple[FramePlace, ...]], list[int]] = defaultdict(list)
     for core in sorted({task.core for task in tasks if task.role == "executor"}):
-        own = [task for task in tasks if task.core == core and task.role == "executor"]
+        executors = [task for task in tasks if task.core == core and task.role == "executor"]
         for frame in range(major // minor):
-            if places := tuple(_places(own, work, major + frame * minor, minor)):
-                found[core, places].append(frame)
+            if places := tuple(_places(executors, work, major + frame * minor, minor)):
+                distinct[core, places].append(frame)
     return tuple(
-        CoreFrames(core, tuple(frames), places) for (core, places), frames in found.items()
+        CoreFrames(core, tuple(frames), places) for (core, places), frames in distinct.items()
     )
 
 
 def _places(tasks: Sequence[TimedTask], work: Work, start: int, minor: int) -> Iterator[FramePlace]:
-    """Yield the places of a frame that begins at `start`, of the tasks of one core."""
+    """Yield the places of one core's tasks in one frame.
+
+    Args:
+        tasks: Tasks of the core.
+        work: Spans of all jobs.
+        start: Start of the frame, ns.
+        minor: Length of the frame, ns.
+    """
     frame_end = start + minor
     released = sorted(
         (start + (task.phase_ns - start) % task.every_ns, -task.priority, task.name, task.cost_ns)
         for task in tasks
     )
-    released = [found for found in released if found[0] < frame_end]
+    released = [release for release in released if release[0] < frame_end]
     begins = start
     for at, (release, _, board, cost_ns) in enumerate(released, 1):
         later = released[at:]
@@ -107,7 +120,7 @@ def _places(tasks: Sequence[TimedTask], work: Work, start: int, minor: int) -> I
         is_last = not later or later[0][0] > release
         spans = work[board, release]
         done = sum(min(s.end_ns, limit) - s.start_ns for s in spans if s.start_ns < limit)
-        # What is not done by the limit ends there.
+        # A job that is not done by the limit counts as ending at the limit.
         end = spans[-1].end_ns if done == cost_ns else limit
         begins = max(begins, release)
         yield FramePlace(

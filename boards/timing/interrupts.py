@@ -1,4 +1,4 @@
-"""What messages that interrupt a board cost it, and how many of them wait, in the worst case."""
+"""Worst-case cost and number of the interrupts that messages cause on a board."""
 
 from __future__ import annotations
 
@@ -10,11 +10,14 @@ from rack.backplane.mailbox.inbox import Burst, InterruptSource, burst_of
 
 @dataclass(frozen=True)
 class InboxTiming:
-    """The inbox of a board, served by its task `task`; `depth` messages may wait.
+    """Inbox of a board that messages interrupt.
 
-    `mailboxes` are those whose messages interrupt it, `sources` their periods and services, in the
-    same order; ns of simulated time. A mailbox that is not written in every cycle counts as if it
-    were.
+    Attributes:
+        task: Task that serves the inbox.
+        mailboxes: Mailboxes whose messages interrupt the board.
+        sources: Their periods and service times, in the same order, ns of simulated time. A mailbox
+            that is not written in every cycle counts as if it were.
+        depth: Largest number of pending interrupts.
     """
 
     task: str
@@ -23,16 +26,16 @@ class InboxTiming:
     depth: int
 
     def cost_ns(self, span_ns: int) -> int:
-        """Return the processor time of the handler for what comes in a span of time."""
+        """Return the processor time of the interrupts that arrive in a span of time, ns."""
         return sum(source.service_ns * -(-span_ns // source.every_ns) for source in self.sources)
 
     @property
     def burst(self) -> Burst:
-        """The worst case: all sources send at once."""
+        """Worst case, in which all sources send at once."""
         return burst_of(self.sources)
 
     def document(self, cycle_ns: int) -> dict[str, Any]:
-        """Return it as plain data, with its cost in a cycle of its board; ns."""
+        """Return the worst case as plain data, for JSON. `cycle_ns` is the board's cycle, ns."""
         burst = self.burst
         return {
             "task": self.task,

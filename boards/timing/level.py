@@ -1,4 +1,4 @@
-"""The timing of one board: its data for the timing model, and its times in the paper's terms."""
+"""Timing of one board: its data for the timing model, and its times in the paper's terms."""
 
 from __future__ import annotations
 
@@ -14,16 +14,28 @@ Coupling = Literal["tight", "loose", "none"]
 
 @dataclass(frozen=True)
 class BoardTiming:
-    """One board. `every` is its cycle, `phase` its first release, in ticks; cores are those that
-    the config asks for.
+    """Data of one board for the timing model.
 
-    `above` and `below` name each other: a board is above all that it lists below, and all that list
-    it above.
-
-    `is_critical` is true if the plan update is the paper's critical section: it keeps the executor
-    waiting. `budget` is None if unknown. `plan_within_ns` is the time within which the config wants
-    a new plan, wall clock. `queues` are the mailboxes in which messages wait for it. `reads` holds
-    the ticks at which it reads the messages of another board, by that board, if not in every cycle.
+    Attributes:
+        name: Name of the board.
+        above: Boards directly above it.
+        below: Boards directly below it. The relation holds if either board names the other.
+        coupling: How executor and planner share processors.
+        every: Period of the executor, ticks.
+        within_cycles: Cycles that a plan may take.
+        core: Core that the config requests for the executor.
+        priority: SCHED_FIFO priority of the executor.
+        planner_core: Core that the config requests for the planner.
+        planner_priority: SCHED_FIFO priority of the planner.
+        has_planner: Whether the level has a planner.
+        is_critical: Whether the plan update is the paper's critical section, for which the executor
+            has to wait.
+        budget: Processor times. None if they are not known.
+        plan_within_ns: Longest time for a new plan that the config accepts, ns of the wall clock.
+        queues: Queues that it reads.
+        phase: First release, ticks.
+        reads: Ticks at which it reads the messages of another board, by that board. Boards whose
+            messages it reads in every cycle are left out.
     """
 
     name: str
@@ -46,29 +58,37 @@ class BoardTiming:
 
     @property
     def releases(self) -> TickGrid:
-        """The ticks at which its cycles begin."""
+        """Ticks at which its cycles begin."""
         return TickGrid(self.every, self.phase)
 
     @property
     def is_plan_budgeted(self) -> bool:
-        """Whether the budget covers its planner: in a measured run the planner may have made no
-        plan.
-        """
+        """Whether the budget contains planning time. It does not if a measured run had no plan."""
         return self.has_planner and self.budget is not None and self.budget.plan_ns > 0
 
     @property
     def exchange_ns(self) -> int:
-        """The budget's time for reading the plan in each cycle; 0: no planner, or no budget."""
+        """Time for reading the plan in each cycle, ns. 0 without a planner or a budget."""
         return self.budget.exchange_ns if self.has_planner and self.budget is not None else 0
 
 
 @dataclass(frozen=True)
 class LevelTiming:
-    """One level in the worst case, ns of the wall clock.
+    """Worst-case times of one level, ns of the wall clock.
 
-    `cycle_ns` is R_i, `longest_cycle_ns` is R_max (see `RackTiming.longest_cycles`). `exchange_ns`
-    (C) and `update_ns` (U) pass the plan between planner and executor. `within_cycles` is d; it and
-    `plan_ns` (P) are None without a planner, or if the budget does not cover it.
+    Attributes:
+        board: Board of the level.
+        coupling: How executor and planner share processors.
+        cycle_ns: R_i, the cycle of the level.
+        longest_cycle_ns: R_max. See `RackTiming.longest_cycles`.
+        read_ns: R, reading commands and statuses.
+        execution_ns: t_exec, the processing of the executor.
+        write_ns: W, writing commands and statuses.
+        exchange_ns: C, reading the plan.
+        plan_ns: P, making one plan. None without a planner, or if the budget has no time for it.
+        update_ns: U, writing the plan.
+        within_cycles: d, the cycles that a plan may take. None if `plan_ns` is None.
+        plan_within_ns: Longest time for a new plan that the config accepts.
     """
 
     board: str
@@ -86,40 +106,39 @@ class LevelTiming:
 
     @property
     def interlevel_ns(self) -> int:
-        """t_interlevel of eq. 3.9: commands and statuses, R and W."""
+        """t_interlevel of eq. 3.9: reading and writing commands and statuses, R + W."""
         return self.read_ns + self.write_ns
 
     @property
     def communication_ns(self) -> int:
-        """t_comm of eq. 3.5: the executor's communication in every cycle, R, W and C."""
+        """t_comm of eq. 3.5: communication of the executor in every cycle, R + W + C."""
         return self.interlevel_ns + self.exchange_ns
 
     @property
     def executor_planner_ns(self) -> int:
-        """t_executor-planner of eqs 3.9 and 3.10: the plan read and updated, C and U, both in the
-        worst cycle.
-        """
+        """t_executor-planner of eqs 3.9 and 3.10: C + U, which coincide in the worst cycle."""
         return self.exchange_ns + self.update_ns
 
     @property
     def residual_ns(self) -> int:
-        """t_residual of eq. 3.5, and alpha of eq. 3.6: the budget's times are the longest of all
-        cycles.
+        """t_residual of eq. 3.5, the rest of the cycle.
+
+        It is also alpha of eq. 3.6, because the budget's times are the longest of all cycles.
         """
         return self.cycle_ns - self.execution_ns - self.communication_ns
 
     @property
     def planning_ns(self) -> int | None:
-        """t_plan of eq. 3.8: one plan and its update, P and U."""
+        """t_plan of eq. 3.8: one plan and its update, P + U. None without a planner."""
         return None if self.plan_ns is None else self.plan_ns + self.update_ns
 
     @property
     def slice_ns(self) -> int | None:
-        """Time from a planner's release until its plan is available: d R_i."""
+        """Time from a planner's release until its plan is available, d R_i. None without one."""
         return None if self.within_cycles is None else self.within_cycles * self.cycle_ns
 
     def document(self) -> dict[str, Any]:
-        """Return everything as plain data."""
+        """Return all times as plain data, for JSON."""
         derived = (
             "communication_ns",
             "executor_planner_ns",

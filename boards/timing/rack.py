@@ -1,4 +1,4 @@
-"""The data of a rack for the timing model."""
+"""Data of a rack for the timing model, and the results for its boards, tasks and chains."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from rack.boards.timing.tasks import Part, TimedTask, Unit
 
 
 class CyclicSchedule(NamedTuple):
-    """A static cyclic schedule: the minor frame and the major one, a multiple of it, in ticks."""
+    """Static cyclic schedule: length of the minor frame and of the major frame, ticks."""
 
     minor: int
     major: int
@@ -26,14 +26,21 @@ class CyclicSchedule(NamedTuple):
 
 @dataclass(frozen=True)
 class RackTiming:
-    """The data of a rack for the timing model.
+    """Data of a rack for the timing model.
 
-    `clock_ns` is one tick of simulated time. `clock` is the task of the system clock, released
-    every tick of the wall clock; its cost is 0 if unknown. `context_switch_ns` is t_cs,
-    `small_share` the limit of eq. 3.10. `response_goal_ns` is the goal for the system's response,
-    simulated time. Budgets are processor times: a `speed` factor shortens the cycles, not the
-    budgets. `inboxes`, by task, are those of boards that messages interrupt; budgets do not include
-    what that costs.
+    Attributes:
+        is_lockstep: Whether the clock runs in lockstep.
+        speed: Simulated time divided by real time. It changes cycles, but not budgets, which are
+            processor times.
+        clock_ns: One tick, ns of simulated time.
+        clock: Task of the system clock, released every tick. Its cost is 0 if it is not known.
+        boards: Boards by name.
+        context_switch_ns: t_cs, the time of one context switch, ns.
+        small_share: Limit of eq. 3.10.
+        response_goal_ns: Goal for the system response, ns of simulated time. None without a goal.
+        inboxes: Inboxes of boards that messages interrupt, by task. Budgets do not include the time
+            of interrupts.
+        schedule: Static cyclic schedule. None if the rack has none.
     """
 
     is_lockstep: bool
@@ -45,51 +52,53 @@ class RackTiming:
     small_share: float
     response_goal_ns: float | None
     inboxes: Mapping[str, InboxTiming]
-    schedule: CyclicSchedule | None  # a static one, if the rack has it
+    schedule: CyclicSchedule | None
 
     @property
     def tick_ns(self) -> int:
-        """One tick of the wall clock."""
+        """One tick, ns of the wall clock."""
         return self.clock.every_ns
 
     def changed(self, board: str, **changes: Any) -> RackTiming:
-        """Return the rack with other values of a board."""
+        """Return a copy of the rack in which fields of one board have other values."""
         return replace(self, boards={**self.boards, board: replace(self.boards[board], **changes)})
 
     @cached_property
     def chains(self) -> tuple[tuple[str, ...], ...]:
-        """Every chain of boards from a highest to a lowest; a rack with a board per joint has one
-        for every joint.
+        """Every chain of boards from a highest to a lowest level.
+
+        A rack with one board per joint has a chain for each joint.
         """
         lowest = [board.name for board in self.boards.values() if board.above and not board.below]
         return tuple(chain for name in lowest for chain in self._chains((name,)))
 
-    def _chains(self, part: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
-        """Yield every chain that ends with `part`."""
-        above = self.boards[part[0]].above
+    def _chains(self, lower_end: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
+        """Yield every chain that ends with these boards."""
+        above = self.boards[lower_end[0]].above
         if not above:
-            yield part
+            yield lower_end
         for name in above:
-            yield from self._chains((name, *part))
+            yield from self._chains((name, *lower_end))
 
     @cached_property
     def parallel(self) -> tuple[ParallelChains, ...]:
-        """All chains: those of equal cycles together where they are every combination of their
-        boards.
+        """All chains, grouped.
+
+        Chains of equal cycles form a group if they are all combinations of their boards.
         """
         by_cycles: dict[tuple[int, ...], list[tuple[str, ...]]] = {}
         for chain in self.chains:
             by_cycles.setdefault(tuple(self.boards[name].every for name in chain), []).append(chain)
-        found = []
+        parallel = []
         for cycles, chains in by_cycles.items():
-            is_every = len(chains) == prod(len(set(boards)) for boards in zip(*chains, strict=True))
-            together = [chains] if is_every else [[chain] for chain in chains]
-            found += [ParallelChains(tuple(part), cycles) for part in together]
-        return tuple(found)
+            combinations = prod(len(set(boards)) for boards in zip(*chains, strict=True))
+            groups = [chains] if len(chains) == combinations else [[chain] for chain in chains]
+            parallel += [ParallelChains(tuple(group), cycles) for group in groups]
+        return tuple(parallel)
 
     @property
     def hierarchy(self) -> ParallelChains:
-        """The chains with the longest response; without levels above each other, none."""
+        """Group of chains with the longest response. Empty if no board is above another."""
         return max(self.parallel, key=self.command_ticks, default=ParallelChains((), ()))
 
     def command_ticks(self, chains: ParallelChains) -> int:
@@ -101,22 +110,27 @@ class RackTiming:
         return max((self.response_ticks(chain[::-1]) for chain in chains.chains), default=0)
 
     def response_ticks(self, boards: Sequence[str]) -> int:
-        """Return the longest response along boards, in the order in which the information passes,
-        ticks: from the release of the first to the end of the cycle of the last that acts on it.
+        """Return the longest response along a row of boards, ticks.
 
-        Each level takes its cycle (eq. 3.3); a message also waits for its next read on the grid.
+        It lasts from the release of the first board to the end of the cycle in which the last board
+        acts. Each level takes one cycle (eq. 3.3), and each message waits for the next read of its
+        reader.
+
+        Args:
+            boards: Names of the boards, in the order in which the information passes.
         """
-        passed = [self.boards[name] for name in boards]
+        row = [self.boards[name] for name in boards]
         waits = [
-            grid_wait(one.releases, other.reads.get(one.name, other.releases))
-            for one, other in pairwise(passed)
+            grid_wait(sender.releases, receiver.reads.get(sender.name, receiver.releases))
+            for sender, receiver in pairwise(row)
         ]
-        return sum(waits) + sum(board.every for board in passed)
+        return sum(waits) + sum(board.every for board in row)
 
     @cached_property
     def ranks(self) -> tuple[tuple[str, ...], ...]:
-        """The boards of all chains by level, the highest first: each as far down as its longest
-        chain from above.
+        """Boards of all chains by rank, the highest rank first.
+
+        The rank of a board is its position in the longest chain that leads down to it.
         """
         depth: dict[str, int] = {}
         for chain in self.chains:
@@ -128,30 +142,30 @@ class RackTiming:
 
     @cached_property
     def longest_cycles(self) -> dict[str, float]:
-        """R_max by board, in ticks: the longest cycle that a level may have.
+        """R_max by board: the longest cycle that a level may have, ticks.
 
-        With a goal for the response it is R_s / n (eq. 3.2), n being the levels of the longest
-        chain through the board; otherwise the longest cycle in its hierarchy. A board outside of
-        all hierarchies has its own cycle.
+        With a goal for the response it is R_s / n (eq. 3.2), where n is the number of levels in the
+        longest chain through the board. Otherwise it is the longest cycle in the hierarchy of the
+        board. For a board without neighbours it is its own cycle.
         """
-        found = {name: float(board.every) for name, board in self.boards.items()}
+        longest = {name: float(board.every) for name, board in self.boards.items()}
         if self.response_goal_ns is None:
-            # Chains that share a board are of one hierarchy: the longest passes from one to the
-            # next, at least one chain farther in each round.
+            # Chains that share a board belong to one hierarchy. In each round the longest cycle is
+            # propagated to at least one more chain.
             for chain in self.chains * len(self.chains):
-                found |= dict.fromkeys(chain, max(found[name] for name in chain))
+                longest |= dict.fromkeys(chain, max(longest[name] for name in chain))
         else:
             for chain in sorted(self.chains, key=len):
-                found |= dict.fromkeys(chain, self.response_goal_ns / self.clock_ns / len(chain))
-        return found
+                longest |= dict.fromkeys(chain, self.response_goal_ns / self.clock_ns / len(chain))
+        return longest
 
     def level(self, board: str) -> LevelTiming:
-        """Return the timing of a level that has a budget. Raises `KeyError`."""
+        """Return the timing of a level. Raises `KeyError` for a board without a budget."""
         table = self.boards[board]
         budget = table.budget
         if budget is None:
             raise KeyError(board)
-        planned = table.is_plan_budgeted
+        has_plan = table.is_plan_budgeted
         plan_ns = budget.plan_ns + self.interrupted_ns(f"{board}.planner")
         return LevelTiming(
             board=board,
@@ -162,15 +176,16 @@ class RackTiming:
             execution_ns=budget.process_ns,
             write_ns=budget.write_ns,
             exchange_ns=table.exchange_ns,
-            plan_ns=plan_ns if planned else None,
-            update_ns=budget.update_ns if planned else 0,
-            within_cycles=table.within_cycles if planned else None,
-            plan_within_ns=table.plan_within_ns if planned else None,
+            plan_ns=plan_ns if has_plan else None,
+            update_ns=budget.update_ns if has_plan else 0,
+            within_cycles=table.within_cycles if has_plan else None,
+            plan_within_ns=table.plan_within_ns if has_plan else None,
         )
 
     def interrupted_ns(self, task: str) -> int:
-        """Return the processor time that interrupts take from a task in a cycle, or in a plan; 0 if
-        it serves none.
+        """Return the processor time of interrupts in one cycle of a task, or in one plan, ns.
+
+        0 if the task does not serve an inbox.
         """
         inbox = self.inboxes.get(task)
         return 0 if inbox is None else inbox.cost_ns(self.slice_ticks(task) * self.clock_ns)
@@ -184,7 +199,7 @@ class RackTiming:
 
     @cached_property
     def levels(self) -> dict[str, LevelTiming]:
-        """The timing of every level that has a budget, by board."""
+        """Timing of every level that has a budget, by board."""
         return {
             name: self.level(name)
             for name, board in self.boards.items()
@@ -193,7 +208,7 @@ class RackTiming:
 
     @cached_property
     def tasks(self) -> tuple[TimedTask, ...]:
-        """The clock's task if its cost is known, and those of every board that has a budget."""
+        """Tasks of the clock, if its cost is known, and of every board that has a budget."""
         clock = (self.clock,) if self.clock.cost_ns else ()
         return (*clock, *(task for board in self.boards.values() for task in self._tasks(board)))
 
@@ -236,28 +251,26 @@ class RackTiming:
 
     @cached_property
     def cores(self) -> dict[str, int]:
-        """The cores that the config asks for, by task, the clock's first; this machine may lack
-        some.
-        """
-        found = {self.clock.name: self.clock.core}
+        """Core that the config requests for each task. This machine may not have all of them."""
+        cores = {self.clock.name: self.clock.core}
         for board in self.boards.values():
-            found[board.name] = board.core
+            cores[board.name] = board.core
             if board.has_planner:
-                found[f"{board.name}.planner"] = board.planner_core
-        return found
+                cores[f"{board.name}.planner"] = board.planner_core
+        return cores
 
     def cores_of(self, board: str) -> set[int]:
-        """Return the cores of a board's tasks."""
+        """Return the cores that the tasks of a board use."""
         return {core for name, core in self.cores.items() if name.partition(".")[0] == board}
 
     @cached_property
     def responses(self) -> tuple[TaskResponse, ...]:
-        """The worst case of every task that has a cost."""
+        """Worst case of every task that has a cost."""
         return task_responses(self.tasks, self.context_switch_ns)
 
     @cached_property
     def loads(self) -> dict[int, float]:
-        """The load of every core, by core; above 1 the core is overloaded."""
+        """Load of each core. Above 1 a core is overloaded."""
         return load_of(self.tasks, self.context_switch_ns)
 
 
@@ -266,8 +279,11 @@ def _nonzero(*parts: Part) -> tuple[Part, ...]:
 
 
 def grid_wait(written: TickGrid, read: TickGrid) -> int:
-    """Return the longest time, ticks, from a message on the grid of its writer to the next read
-    (eq. 3.7).
+    """Return the longest time from writing a message to the next read of its reader, ticks.
+
+    Args:
+        written: Ticks at which messages become visible.
+        read: Ticks at which the reader reads (eq. 3.7).
     """
     common = gcd(written.every, read.every)
     return read.every - common + (read.phase - written.phase) % common

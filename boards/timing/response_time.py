@@ -1,16 +1,16 @@
-"""Worst-case response times of tasks that share a core under fixed priorities: exact analysis,
-beyond the paper.
+"""Worst-case response times of tasks that share a core under fixed priorities.
 
-The recurrence is M. Joseph and P. Pandya's, *Finding Response Times in a Real-Time System*, The
-Computer Journal 29 (1986); with blocking it is N. Audsley et al.'s, *Applying New Scheduling Theory
-to Static Priority Pre-emptive Scheduling*, Software Engineering Journal 8 (1993):
+This analysis is not in the paper. The recurrence is from M. Joseph and P. Pandya, *Finding Response
+Times in a Real-Time System*, The Computer Journal 29 (1986); with blocking it is from N. Audsley et
+al., *Applying New Scheduling Theory to Static Priority Pre-emptive Scheduling*, Software
+Engineering Journal 8 (1993):
 
     R = B + C + sum over all tasks above of ceil(R / T_j) C_j.
 
-This is the response of a job released together with all tasks above it. A rack without phases
-releases all tasks together at tick 0, so the bound is attained. Phases may keep tasks apart for
-ever, as in a static cyclic schedule: then response times are those of the schedule itself, which
-repeats. Times are integers in one unit; a rack uses ns.
+R is the response of a job that is released together with all tasks of higher priority. A rack
+without phases releases all tasks together at tick 0, so this bound is reached. Phases can keep
+releases apart for ever, as in a static cyclic schedule. Response times are then taken from the
+schedule itself, which repeats. Times are integers in one unit, which is ns for a rack.
 """
 
 from __future__ import annotations
@@ -27,20 +27,19 @@ from rack.boards.timing.schedule import simulate
 from rack.boards.timing.tasks import Part, TimedTask, Unit
 
 Load = tuple[int, int]
-"""Demand of a task on its core: cost C of a job, and period T."""
+"""Demand of a task on its core: cost C of a job and period T, in one unit."""
 
 TURN_NS = 4_000_000
-"""Longest turn of an ordinary task while another waits: one tick of a 250 Hz kernel (Linux's own
-slice is 3 ms)."""
+"""Longest turn of a task under ordinary scheduling while another waits.
+
+One tick of a 250 Hz kernel. The time slice of Linux is 3 ms.
+"""
 HORIZON_DEADLINES = 10
-"""The search for a response time ends after this many deadlines: near full load it converges too
-slowly."""
+"""Number of deadlines after which the search ends, because it converges slowly near full load."""
 MAX_JOBS = 20_000
-"""Limit on the jobs of a schedule that is computed for its response times; beyond it the bound must
-do."""
+"""Largest schedule, in jobs, that is computed for response times. For others the bound is used."""
 MAX_STEPS = 10_000
-"""Limit on the steps of one search: a 10 us tick against a plan of hours takes too many before any
-deadline."""
+"""Limit on the steps of one search, which a 10 us tick below a plan of hours would exceed."""
 
 
 def response_time(
@@ -51,20 +50,25 @@ def response_time(
     sharing: Sequence[Load],
     horizon: int,
 ) -> int | None:
-    """Return the longest time from a job's release to its end; None: no bound, or none within the
-    `horizon`.
+    """Compute the longest time from the release of a job to its end.
 
-    `above` are the tasks of higher or equal priority on the core: each delays the job by whole jobs
-    of its own. `blocking` is the longest part of a lower task that cannot be preempted.
+    Releases do not queue: a late task takes the newest release and skips the others. A job
+    therefore never waits for an earlier job of its task, and a response longer than the period is a
+    deadline miss.
 
-    Releases do not queue: a late task takes up the newest release and skips the others, so the job
-    finds its task free, and a response longer than the task's period is a miss.
+    Args:
+        cost: Processor time of the job.
+        above: Tasks of higher or equal priority on the core. Each delays the job by whole jobs.
+        blocking: Longest part of a task of lower priority that cannot be preempted.
+        sharing: Tasks under ordinary scheduling that take turns with this one. While the job waits,
+            each of them computes at most as long as the job plus one turn. This assumes fair turns,
+            which Linux does not guarantee.
+        horizon: Time after which the search ends.
 
-    `sharing` are tasks under ordinary scheduling that take turns with this one: while it waits,
-    none of them computes more than it does, plus one turn. That bound assumes fair turns, which
-    Linux does not guarantee.
+    Returns:
+        None if there is no bound, or none within the horizon.
     """
-    # Below full load a bound exists; near full load the search for it may take too long.
+    # A bound exists below full load, but near full load the search for it may take too long.
     if cost and sum(Fraction(*load) for load in above) >= 1:
         return None
 
@@ -72,7 +76,7 @@ def response_time(
         turns = sum(min(_released(until, load), cost + TURN_NS) for load in sharing)
         return blocking + cost + turns + sum(_released(until, load) for load in above)
 
-    # The end is the smallest time at which all work released before it is done.
+    # The job ends at the smallest time at which all work released before that time is done.
     end = blocking + cost
     for _ in range(MAX_STEPS):
         if end > horizon:
@@ -89,46 +93,54 @@ def _released(until: int, load: Load) -> int:
 
 
 def _scheduled(tasks: Sequence[TimedTask], context_switch_ns: int) -> dict[str, int]:
-    """Return the response times of the tasks of one core, from their schedule; empty where it
-    decides nothing.
+    """Return exact response times of the tasks of one core from their schedule, by task.
 
-    In the worst case every job takes its whole budget: under fixed priorities shorter jobs delay no
-    other. A planner may plan at any release, so its jobs have no fixed place. Tasks of equal
-    priority must never wait at the same time, since their order is not fixed either.
+    In the worst case every job uses its whole budget, because under fixed priorities a shorter job
+    never delays another.
+
+    Returns:
+        Empty if the schedule is not exact: if there are planners, which may plan at any release; if
+        tasks of equal priority wait at the same time, so that their order is not fixed; if a
+        deadline is missed; or if the schedule is too long.
     """
     period = lcm(*(task.period_ns for task in tasks))
     first = max(task.phase_ns for task in tasks)
     until = first + 2 * period
-    is_open = any(task.role == "planner" for task in tasks)
-    if is_open or sum(until // task.period_ns for task in tasks) > MAX_JOBS:
+    has_planner = any(task.role == "planner" for task in tasks)
+    if has_planner or sum(until // task.period_ns for task in tasks) > MAX_JOBS:
         return {}
-    whole = [as_one_part(task, context_switch_ns) for task in tasks]
-    chart = simulate(whole, until + max(task.period_ns for task in tasks))
+    single_part_tasks = [as_one_part(task, context_switch_ns) for task in tasks]
+    chart = simulate(single_part_tasks, until + max(task.period_ns for task in tasks))
     priorities = {task.name: task.priority for task in tasks}
-    spent = defaultdict[int, list[tuple[int, int]]](list)
-    found = dict.fromkeys(priorities, 0)
+    intervals = defaultdict[int, list[tuple[int, int]]](list)
+    responses = dict.fromkeys(priorities, 0)
     for job in chart.jobs:
         if job.release_ns >= until:
             continue
         if job.end_ns is None or job.end_ns > job.deadline_ns:
             return {}
-        found[job.task] = max(found[job.task], job.end_ns - job.release_ns)
-        spent[priorities[job.task]].append((job.release_ns, job.end_ns))
-    shared = any(
+        responses[job.task] = max(responses[job.task], job.end_ns - job.release_ns)
+        intervals[priorities[job.task]].append((job.release_ns, job.end_ns))
+    is_order_open = any(
         later[0] < earlier[1]
-        for jobs in spent.values()
+        for jobs in intervals.values()
         for earlier, later in pairwise(sorted(jobs))
     )
-    return {} if shared else found
+    return {} if is_order_open else responses
 
 
 @dataclass(frozen=True)
 class TaskResponse:
-    """One task in the worst case, ns.
+    """Worst case of one task.
 
-    `job_ns` is its own processor time with two context switches, `blocking_ns` the longest wait for
-    a task of lower priority, `response_ns` the time from its release to its end, None without a
-    bound.
+    Attributes:
+        task: Name of the task.
+        core: Its core.
+        priority: Its SCHED_FIFO priority.
+        job_ns: Processor time of a job with two context switches, ns.
+        blocking_ns: Longest wait for a task of lower priority, ns.
+        response_ns: Time from the release of a job to its end, ns. None without a bound.
+        deadline_ns: Time from the release to the deadline, ns.
     """
 
     task: str
@@ -141,30 +153,32 @@ class TaskResponse:
 
     @property
     def holds(self) -> bool:
-        """Whether it always meets its deadline."""
+        """Whether the task always meets its deadline."""
         return self.response_ns is not None and self.response_ns <= self.deadline_ns
 
     def document(self) -> dict[str, Any]:
-        """Return everything as plain data."""
+        """Return the worst case as plain data, for JSON."""
         return asdict(self) | {"holds": self.holds}
 
 
 def task_responses(
     tasks: Iterable[TimedTask], context_switch_ns: int = 0
 ) -> tuple[TaskResponse, ...]:
-    """Return the worst case of every task with a cost.
+    """Compute the worst case of every task that has a cost.
 
-    A job takes two context switches, into it and out of it (eq. 3.9); its response includes both.
-    Tasks of equal priority delay each other by whole jobs; tasks under ordinary scheduling
-    (priority 0) take turns. The bound is exact for tasks of different priorities without blocking;
-    it does not credit a job for its own parts that cannot be preempted. On a core with phases the
-    schedule itself is exact, if it repeats.
+    A job has two context switches, to it and from it (eq. 3.9), and its response includes both.
+    Tasks of equal priority delay each other by whole jobs. Tasks under ordinary scheduling
+    (priority 0) take turns.
+
+    The bound is exact for tasks of different priorities without blocking. It ignores that a job's
+    own parts may not be preemptible. On a core with phases the repeating schedule gives exact
+    times.
     """
     busy = [task for task in tasks if task.cost_ns]
     exact: dict[str, int] = {}
     for core in {task.core for task in busy if task.phase_ns}:
         exact |= _scheduled([task for task in busy if task.core == core], context_switch_ns)
-    found = []
+    responses = []
     for task in busy:
         others = [other for other in busy if other.core == task.core and other is not task]
         shares = [other for other in others if not task.priority and not other.priority]
@@ -180,7 +194,7 @@ def task_responses(
             sharing=[_load(other, context_switch_ns) for other in shares],
             horizon=HORIZON_DEADLINES * task.period_ns,
         )
-        found.append(
+        responses.append(
             TaskResponse(
                 task=task.name,
                 core=task.core,
@@ -191,25 +205,24 @@ def task_responses(
                 deadline_ns=task.period_ns,
             )
         )
-    return tuple(found)
+    return tuple(responses)
 
 
 def job_ns(task: TimedTask, context_switch_ns: int) -> int:
-    """Return the processor time of one job with its two context switches."""
+    """Return the processor time of one job with its two context switches, ns."""
     return task.cost_ns + 2 * context_switch_ns
 
 
 def as_one_part(task: TimedTask, context_switch_ns: int) -> TimedTask:
-    """Return a task whose job with its switches is one stretch of work."""
+    """Return a copy of a task whose job and context switches are one single part."""
     return replace(task, parts=(Part(Unit.PROCESS, job_ns(task, context_switch_ns)),))
 
 
 def blocking_ns(task: TimedTask, tasks: Iterable[TimedTask]) -> int:
-    """Return the longest wait for a task of lower priority on the core, ns: one part that cannot be
-    preempted.
+    """Return the longest wait of a task for a task of lower priority on its core, ns.
 
-    That is a plan update that began before the release and whose ceiling is at least this task's
-    priority (eq. 3.10).
+    It waits for one plan update that began before its release, if the ceiling of the update is at
+    least the priority of this task (eq. 3.10).
     """
     below = (t for t in tasks if t.core == task.core and t.priority < task.priority <= t.ceiling)
     locked = (part.time_ns for t in below for part in t.parts if not part.preemptible)
@@ -217,9 +230,7 @@ def blocking_ns(task: TimedTask, tasks: Iterable[TimedTask]) -> int:
 
 
 def load_of(tasks: Iterable[TimedTask], context_switch_ns: int) -> dict[int, float]:
-    """Return the load of each core, by core, context switches included; above 1 it is
-    overloaded.
-    """
+    """Return the load of each core, including context switches. Above 1 a core is overloaded."""
     loads: dict[int, float] = {}
     for task in tasks:
         if task.cost_ns:

@@ -1,8 +1,8 @@
-"""Gantt charts as data, and the schedule of tasks under fixed priorities, computed instead of run.
+"""Simulated schedule of tasks under fixed priorities, as data for Gantt charts.
 
-The schedule follows the rack's own rules (backplane/clock/wake.py, boards/run/control_loop.py): a
-late task takes up the newest release and skips the others; a planner's release lasts as long as the
-time slice of its plan, and the next release comes after that slice.
+The schedule follows the rules of the rack (backplane/clock/wake.py, boards/run/control_loop.py). A
+late task takes the newest release and skips the others. The next release of a planner comes after
+the time slice of its plan.
 """
 
 from __future__ import annotations
@@ -13,13 +13,20 @@ from dataclasses import dataclass, replace
 from rack.boards.timing.tasks import Part, TimedTask, Unit
 
 Variants = Mapping[str, Sequence[Sequence[Part]]]
-"""Parts of tasks that differ from cycle to cycle, by task: one sequence per cycle, in turn."""
+"""Parts of tasks whose cycles differ, by task: one sequence for each cycle, used in rotation."""
 
 
 @dataclass(frozen=True)
 class Span:
-    """An uninterrupted stretch in which a task computed one unit function, ns; `release_ns` is its
-    job's.
+    """Uninterrupted interval in which a task computes one unit function.
+
+    Attributes:
+        task: Name of the task.
+        core: Its core.
+        unit: The unit function.
+        start_ns: Start of the interval, ns.
+        end_ns: End of the interval, ns.
+        release_ns: Release of the job, ns.
     """
 
     task: str
@@ -32,9 +39,13 @@ class Span:
 
 @dataclass(frozen=True)
 class Job:
-    """The work of one release, times in ns. `end_ns` is None while the job is unfinished.
+    """Work of one release. A release that a late executor skipped is a job that never ends.
 
-    A release that an executor skipped, because it was late, is a job that never ends.
+    Attributes:
+        task: Name of the task.
+        release_ns: Release, ns.
+        deadline_ns: Deadline, ns.
+        end_ns: End, ns. None if the job is unfinished.
     """
 
     task: str
@@ -45,7 +56,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Chart:
-    """Spans and jobs between `start_ns` and `end_ns`, each in order of time."""
+    """Schedule between two times, ns. Spans and jobs are in order of time."""
 
     start_ns: int
     end_ns: int
@@ -53,8 +64,9 @@ class Chart:
     jobs: tuple[Job, ...]
 
     def late(self, task: str) -> list[Job]:
-        """Return the jobs of a task that missed their deadline, unfinished ones included."""
-        unfinished = self.end_ns + 1  # on a deadline at the end, too
+        """Return the jobs of a task that missed their deadline, including unfinished jobs."""
+        # An unfinished job also misses a deadline at the very end of the chart.
+        unfinished = self.end_ns + 1
         return [
             job
             for job in self.jobs
@@ -63,10 +75,10 @@ class Chart:
         ]
 
     def window(self, start_ns: int, end_ns: int) -> Chart:
-        """Return the chart from `start_ns` to `end_ns`: spans are cut there, jobs kept whole.
+        """Return the part of the chart between two times. Spans are cut there, jobs are not.
 
-        A job is in the window if it was released in it, or was unfinished or not yet due at its
-        start.
+        A job belongs to the window if it is released in it, or if it is unfinished or not yet due
+        at its start.
         """
         spans = tuple(
             replace(span, start_ns=max(span.start_ns, start_ns), end_ns=min(span.end_ns, end_ns))
@@ -87,11 +99,16 @@ def simulate(
     context_switch_ns: int = 0,
     variants: Variants | None = None,
 ) -> Chart:
-    """Return the exact schedule of `tasks` from 0 until `until_ns`; each is first released at its
-    phase.
+    """Compute the schedule of tasks from time 0.
 
-    A job takes two context switches, one before its parts and one after; they show as idle time.
-    Ordinary scheduling, priority 0, is simulated as first come, first served.
+    A job has two context switches, one before its parts and one after them, which appear as idle
+    time. Ordinary scheduling (priority 0) is simulated as first come, first served.
+
+    Args:
+        tasks: The tasks, on any cores. Each is first released at its phase.
+        until_ns: End of the schedule, ns.
+        context_switch_ns: Time of one context switch, ns.
+        variants: Parts of tasks whose cycles differ. Other tasks use `TimedTask.parts`.
     """
     runners = [
         _Runner(task, context_switch_ns, (variants or {}).get(task.name, (task.parts,)))
@@ -109,21 +126,25 @@ def simulate(
 
 
 def _run(runners: list[_Runner], until_ns: int) -> None:
-    """Run the tasks of one core, from one possible preemption to the next."""
+    """Simulate the tasks of one core, from one possible preemption to the next."""
     now = 0
     while now < until_ns:
         ready = [runner for runner in runners if runner.ready_at <= now]
-        coming = min((r.ready_at for r in runners if r.ready_at > now), default=until_ns)
+        next_release = min((r.ready_at for r in runners if r.ready_at > now), default=until_ns)
         if not ready:
-            now = coming
+            now = next_release
             continue
         first = min(ready, key=_Runner.order)
-        now = first.compute(now, min(coming, until_ns))
+        now = first.compute(now, min(next_release, until_ns))
 
 
 class _Runner:
-    """One task, job by job. `ready_at` is the time at which its job, or the next one, can begin,
-    ns.
+    """Simulation of one task.
+
+    Attributes:
+        task: The task.
+        spans: Its spans so far.
+        ready_at: Time at which its present job could begin, or its next one can, ns.
     """
 
     def __init__(
@@ -134,22 +155,23 @@ class _Runner:
         self.ready_at = task.phase_ns
         self._switch = [Part(None, context_switch_ns)] if context_switch_ns else []
         self._variants = variants
-        self._steps: list[Part] = []  # remaining steps of the job
-        self._spent_ns = 0  # on the first remaining step
+        # Remaining steps of the job, and the time already spent on the first of them.
+        self._steps: list[Part] = []
+        self._spent_ns = 0
         self._release = -1
-        # A planner cannot be late for its first plan.
+        # Largest age of the release of the next job. No planner can be late for its first plan.
         self._slack_ns = 0
         self._ends: dict[int, int | None] = {}
 
     def order(self) -> tuple[int, bool, int, str]:
-        """Return its rank among the ready tasks: the lowest computes."""
+        """Return the rank among the ready tasks. The task with the lowest rank computes."""
         is_locked = self._spent_ns > 0 and not self._steps[0].preemptible
         priority = max(self.task.priority, self.task.ceiling) if is_locked else self.task.priority
-        # A protected part continues before tasks of that priority that were released meanwhile.
+        # A protected part that has begun precedes tasks of the same priority released since.
         return -priority, not is_locked, self.ready_at, self.task.name
 
     def compute(self, now_ns: int, until_ns: int) -> int:
-        """Compute from `now_ns` until a part ends, at most until `until_ns`; return that time."""
+        """Compute from `now_ns` until a part ends or until `until_ns`, and return that time."""
         if not self._steps:
             self._take(now_ns)
         if not self._steps:
@@ -180,7 +202,7 @@ class _Runner:
         return end
 
     def _take(self, now_ns: int) -> None:
-        """Take up the oldest release that has not expired."""
+        """Begin the job of the oldest release that has not expired."""
         every = self.task.every_ns
         first = self.task.phase_ns
         newest = first + (now_ns - first) // every * every
@@ -197,7 +219,7 @@ class _Runner:
         self.ready_at = self._release + self.task.period_ns
 
     def jobs(self, until_ns: int) -> Iterator[Job]:
-        """Yield the jobs released before `until_ns`; call it once the schedule is complete."""
+        """Yield the jobs released before `until_ns`. Call this when the schedule is complete."""
         if not self._steps and self.ready_at < until_ns:
             self._take(until_ns - 1)
         if self._release not in self._ends and self._release >= 0:

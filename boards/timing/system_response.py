@@ -1,6 +1,4 @@
-"""The response of the whole system, predicted: its bounds (eqs 3.2, 3.3), and the mailboxes along
-which information passes.
-"""
+"""Predicted system response: its bounds (eqs 3.2, 3.3) and the mailboxes on its path."""
 
 from __future__ import annotations
 
@@ -14,11 +12,16 @@ from rack.boards.timing.rack import RackTiming
 
 @dataclass(frozen=True)
 class Prediction:
-    """Response of the hierarchy, in ms of simulated time; all 0 without one. `levels` are its
-    boards by level, as text.
+    """Predicted response of the hierarchy, ms of simulated time. All times are 0 without one.
 
-    `command_ms` and `status_ms` are the bounds down and up, with the waits for the grid. `plan_ms`
-    is, by level, the time from a planner's release until its plan can be used.
+    Attributes:
+        levels: Boards of each level, as text.
+        bound_eq_3_2_ms: Bound of eq. 3.2.
+        sum_eq_3_3_ms: Sum of eq. 3.3.
+        command_ms: Longest response of a command, down to the lowest level, including waits for
+            releases.
+        status_ms: Longest response of a status, up to the highest level, including these waits.
+        plan_ms: Time from a planner's release until its plan can be used, by board.
     """
 
     levels: tuple[str, ...]
@@ -30,7 +33,7 @@ class Prediction:
 
 
 def predict(rack: RackTiming) -> Prediction:
-    """Return the system's response as it follows from the cycles alone."""
+    """Predict the system response from the cycles of the boards."""
     hierarchy = rack.hierarchy
     tick_ms = rack.clock_ns * 1e-6
     planned = [board for board in rack.boards.values() if board.has_planner]
@@ -45,11 +48,15 @@ def predict(rack: RackTiming) -> Prediction:
 
 
 def mailboxes_along(layout: Layout, boards: Sequence[str]) -> tuple[MailboxSpec, ...]:
-    """Return the mailboxes that take information from board to board, each resting on the one
-    before.
+    """Return the mailboxes that carry information along a row of boards.
 
-    Where the way is broken, they are those of its end: of the longest part that arrives at the last
-    board. A queue breaks it: how long its messages wait there is for their writer to decide.
+    Each mailbox depends on the one before it. If the path is interrupted, only the longest part
+    that reaches the last board is returned. Queues interrupt it, because the writer determines how
+    long messages wait in them.
+
+    Args:
+        layout: Layout of the rack.
+        boards: Names of the boards, in the order in which the information passes.
     """
     if len(boards) < 2:
         return ()
@@ -60,7 +67,7 @@ def mailboxes_along(layout: Layout, boards: Sequence[str]) -> tuple[MailboxSpec,
 def _along(
     layout: Layout, boards: Sequence[str], taken: Collection[str]
 ) -> tuple[MailboxSpec, ...]:
-    """Return the longest row of mailboxes, one a board, that ends with one of those `taken`."""
+    """Return the longest row of mailboxes, one per board, that ends with one in `taken`."""
     if not boards:
         return ()
     last = [box for box in layout.mailboxes if box.writer == boards[-1] and box.name in taken]

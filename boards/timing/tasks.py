@@ -1,6 +1,4 @@
-"""Budgets of levels, and tasks of the timing model: unit functions of known length, released on a
-grid.
-"""
+"""Tasks of the timing model: unit functions of known length, released periodically."""
 
 from __future__ import annotations
 
@@ -11,11 +9,15 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class Budget:
-    """Worst-case processor times of one level, ns; 0 if a level has no such part.
+    """Worst-case processor times of one level, ns. 0 if the level has no such part.
 
-    `read_ns` (R), `process_ns` (X, t_exec), `write_ns` (W) and `exchange_ns` (C, reading the plan)
-    are of one cycle of the executor. `plan_ns` (P) and `update_ns` (U) are of one plan; the paper's
-    t_plan is their sum.
+    Attributes:
+        read_ns: R, reading commands and statuses in one cycle.
+        process_ns: X or t_exec, processing in one cycle.
+        write_ns: W, writing commands and statuses in one cycle.
+        exchange_ns: C, reading the plan in one cycle.
+        plan_ns: P, making one plan.
+        update_ns: U, writing one plan. The paper's t_plan is P + U.
     """
 
     read_ns: int = 0
@@ -27,21 +29,34 @@ class Budget:
 
 
 class Unit(StrEnum):
-    """The unit functions of the paper's Gantt charts (section 3.4)."""
+    """Unit functions of the paper's Gantt charts (section 3.4).
 
-    # communication with the planner's processor: a loosely coupled executor reads its plan
+    Attributes:
+        EXCHANGE: The executor reads the plan, which it exchanges with the planner's processor.
+        READ: The executor reads commands and statuses.
+        PROCESS: The executor processes.
+        WRITE: The executor writes commands and statuses.
+        PLAN: The planner plans.
+        UPDATE: The planner writes the plan.
+    """
+
     EXCHANGE = "C"
-    READ = "R"  # command and status
-    PROCESS = "X"  # the executor
-    WRITE = "W"  # command and status
-    PLAN = "P"  # the planner
-    UPDATE = "U"  # the plan is updated
+    READ = "R"
+    PROCESS = "X"
+    WRITE = "W"
+    PLAN = "P"
+    UPDATE = "U"
 
 
 @dataclass(frozen=True)
 class Part:
-    """A stretch of one unit function; None: a context switch. A part that is not preemptible runs
-    at its task's `ceiling`.
+    """Uninterrupted part of a job.
+
+    Attributes:
+        unit: Its unit function. None for a context switch.
+        time_ns: Its processor time, ns.
+        preemptible: Whether tasks of higher priority may interrupt it. If not, it runs at the
+            ceiling of its task.
     """
 
     unit: Unit | None
@@ -51,14 +66,21 @@ class Part:
 
 @dataclass(frozen=True)
 class TimedTask:
-    """One task; all times in ns. A job is the work of one release, or of one plan.
+    """A periodic task. Its job is the work of one release, or of one plan.
 
-    The task is released every `every_ns`, first at `phase_ns`. A job may take `within_cycles`
-    cycles; the next job is released after those. `parts` are computed in order. `priority` is
-    SCHED_FIFO's: a higher one preempts; tasks of equal priority run in the order of their releases,
-    then of `name`. Ordinary scheduling is 0, below all. `ceiling` is the priority of parts that are
-    not preemptible: a plan update blocks its own executor and every task that is not above the
-    executor (eq. 3.10).
+    Attributes:
+        name: Name of the task.
+        board: Its board.
+        role: "executor", "planner" or "clock".
+        core: Its core.
+        priority: SCHED_FIFO priority. A higher one preempts. Tasks of equal priority run in the
+            order of their releases, then of their names. 0 is ordinary scheduling, below all.
+        every_ns: Time between two releases, ns.
+        parts: Parts of a job, in order.
+        within_cycles: Number of releases that a job may last. The next job is released after them.
+        ceiling: Priority of the parts that are not preemptible. A plan update blocks its executor
+            and every task that has no higher priority than the executor (eq. 3.10).
+        phase_ns: First release, ns.
     """
 
     name: str
@@ -74,10 +96,10 @@ class TimedTask:
 
     @property
     def period_ns(self) -> int:
-        """The shortest time between the releases of two jobs; also a job's deadline."""
+        """Shortest time between the releases of two jobs, which is also a job's deadline, ns."""
         return self.every_ns * self.within_cycles
 
     @property
     def cost_ns(self) -> int:
-        """Processor time of one job, without context switches."""
+        """Processor time of one job without context switches, ns."""
         return sum(part.time_ns for part in self.parts)

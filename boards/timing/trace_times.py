@@ -1,11 +1,11 @@
-"""Times from a trace: the measured side of the timing model.
+"""Measured times of the timing model, computed from trace records.
 
-Report, analysis, charts, viewer, snapshots and benchmarks all derive their times here. Times are ns
-of the wall clock, unless a function says otherwise.
+Report, analysis, charts, viewer, snapshots and benchmarks all use these functions. Times are ns of
+the wall clock unless a function states otherwise.
 
-A trace measures a unit function in two ways. Its borders are stamped by the wall clock; processor
-time is counted for the cycle as a whole. Where a cycle was preempted the two differ, and
-`unit_times` reconciles them.
+A trace measures unit functions in two ways: their borders have wall-clock time stamps, and the
+processor time is counted for the whole cycle. If a cycle was preempted, the two differ, and
+`compute_unit_times` reconciles them.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from rack.backplane.trace import SKIPPED_SHIFT, Flag
 from rack.boards.timing.tasks import Unit
 
 STAMPS = ("start_ns", "plan_ns", "read_ns", "process_ns", "end_ns")
-"""The time stamps of a record, in order."""
+"""Time stamps of a record, in order."""
 UNITS = {
     "executor": (
         (Unit.EXCHANGE, "start_ns", "plan_ns"),
@@ -28,95 +28,111 @@ UNITS = {
     ),
     "planner": ((Unit.PLAN, "start_ns", "process_ns"), (Unit.UPDATE, "process_ns", "end_ns")),
 }
-"""The unit functions of a record, by role, with their first and last time stamp. A planner's
-reading is part of P."""
+"""Unit functions of a record, by role, with their first and last time stamps.
+
+The reading of a planner is part of P.
+"""
 PERCENTILES = {"p50": 50.0, "p99": 99.0, "p99_9": 99.9}
 UNDISTURBED = 10.0
-"""Percentile of a part's times taken for its undisturbed time: on a host that takes the machine
-away in nearly every plan, their median is not."""
+"""Percentile that is taken as the undisturbed time of a part.
+
+The median would be too large on a host that suspends the machine during nearly every plan.
+"""
 Rows = np.ndarray
 """Trace records of one task, oldest first, (n,), of dtype `rack.backplane.trace.RECORD`."""
 Values = np.ndarray
-"""One value per record, (n,), unless a function says otherwise."""
+"""One value per record, (n,), unless a function states otherwise."""
 Distribution = dict[str, float]
 
 
 def lateness_ns(rows: Rows) -> Values:
-    """Return the time from release to start."""
+    """Return the time from the release of each cycle to its start, ns."""
     return np.asarray(rows["start_ns"] - rows["release_ns"])
 
 
 def response_ns(rows: Rows) -> Values:
-    """Return the time from release to end."""
+    """Return the time from the release of each cycle to its end, ns."""
     return np.asarray(rows["end_ns"] - rows["release_ns"])
 
 
 def lasted_ns(rows: Rows) -> Values:
-    """Return the time from start to end, preemption included."""
+    """Return the time from the start of each cycle to its end, including preemption, ns."""
     return np.asarray(rows["end_ns"] - rows["start_ns"])
 
 
 def execution_ns(rows: Rows) -> Values:
-    """Return t_exec of eq. 3.5 (of a planner: its planning), preemption included."""
+    """Return t_exec of eq. 3.5, or the planning time of a planner, including preemption, ns."""
     return np.asarray(rows["process_ns"] - rows["read_ns"])
 
 
 def communication_ns(rows: Rows) -> Values:
-    """Return t_comm of eq. 3.5: everything between start and end that is not execution."""
+    """Return t_comm of eq. 3.5, all of each cycle that is not execution, ns."""
     return np.asarray(rows["read_ns"] - rows["start_ns"] + rows["end_ns"] - rows["process_ns"])
 
 
 def residual_ns(rows: Rows, slice_ns: int) -> Values:
-    """Return t_residual: the part of a time slice left when the cycle ended; negative after a
-    miss.
+    """Return t_residual, the rest of the time slice at the end of each cycle, ns.
+
+    It is negative if the deadline was missed.
     """
     return np.asarray(rows["release_ns"] + slice_ns - rows["end_ns"])
 
 
 def gaps_ns(rows: Rows, stretches: Values | None = None) -> Values:
-    """Return the time from each start to the next one, shape (n - 1,); less with the number of the
-    recording's stretch for each row: what was between two stretches is unknown.
+    """Return the time from each start to the next one, ns, shape (n - 1,).
+
+    Args:
+        rows: Trace records.
+        stretches: For each record, the number of the recorded stretch that contains it, shape (n,).
+            Times between two stretches are unknown and left out. None for one single stretch.
     """
     gaps = np.diff(rows["start_ns"])
     return gaps if stretches is None else gaps[np.diff(stretches) == 0]
 
 
 def is_missed(rows: Rows) -> Values:
-    """Return which cycles missed their deadline, or wrote a message too late; bool."""
+    """Return whether each cycle missed its deadline or wrote a message too late, bool."""
     return np.asarray((rows["flags"] & Flag.MISSED) > 0)
 
 
 def skipped(rows: Rows) -> Values:
-    """Return the number of releases skipped just before each cycle."""
+    """Return the number of releases that were skipped just before each cycle."""
     return np.asarray(rows["flags"] >> SKIPPED_SHIFT)
 
 
 def counts(rows: Rows) -> tuple[int, int]:
-    """Return the number of cycles missed and of releases skipped."""
+    """Return the number of missed cycles and the number of skipped releases."""
     return int(np.count_nonzero(is_missed(rows))), int(skipped(rows).sum())
 
 
 def plans(rows: Rows) -> Values:
-    """Return the records of a planner that made a plan: a release that passed without one may leave
-    a record too.
+    """Return the records of a planner in which it made a plan.
+
+    A release without a plan may also leave a record.
     """
     return rows[(rows["flags"] & Flag.PLANNED) > 0]
 
 
 def newest_visible(ticks: Values, visible_at: Values) -> Values:
-    """Return the index of the newest message visible at each tick, -1 before the first.
+    """Return the index of the newest message that is visible at each tick. -1 before the first.
 
-    `visible_at` holds the ticks from which messages are visible, in the order of their writing.
+    Args:
+        ticks: The ticks.
+        visible_at: Ticks at which messages become visible, in the order of writing.
     """
-    # A message that becomes visible late delays those after it.
+    # A message that becomes visible late delays the messages after it.
     return np.asarray(np.searchsorted(np.maximum.accumulate(visible_at), ticks, side="right") - 1)
 
 
 def plan_ages(executor: Values, made: Values, visible_at: Values) -> Values:
-    """Return the age in ticks of the plan that each cycle of an executor could read, without cycles
-    before the first.
+    """Return the age of the plan that each cycle of an executor could read, ticks.
 
-    `executor` holds the ticks of its cycles, `made` and `visible_at` those of the plans, in order.
+    Cycles before the first visible plan are left out.
+
+    Args:
+        executor: Ticks of the executor's cycles, in order.
+        made: Ticks at which the plans were requested, in order.
+        visible_at: Ticks at which the plans became visible, in order.
     """
     newest = newest_visible(executor, visible_at)
     seen = newest >= 0
@@ -124,26 +140,32 @@ def plan_ages(executor: Values, made: Values, visible_at: Values) -> Values:
 
 
 def distribution(values: Values) -> Distribution | None:
-    """Return min, p50, p99, p99.9 and max of values of any unit, shape (n,); None when there are
-    none.
+    """Return minimum, percentiles and maximum of values of any unit, shape (n,).
+
+    Returns:
+        The statistics by name: min, p50, p99, p99_9 and max. None without values.
     """
     if not len(values):
         return None
-    found = {"min": float(values.min())}
-    found |= {name: float(np.percentile(values, percent)) for name, percent in PERCENTILES.items()}
-    return {name: round(value, 6) for name, value in (found | {"max": float(values.max())}).items()}
+    percentiles = {name: np.percentile(values, percent) for name, percent in PERCENTILES.items()}
+    statistics = {"min": values.min(), **percentiles, "max": values.max()}
+    return {name: round(float(value), 6) for name, value in statistics.items()}
 
 
 class Occupation:
-    """When a core was occupied: a union of intervals. `starts` and `ends` are those of the union,
-    ns, shape (n,).
+    """Union of time intervals in which a core was occupied.
+
+    Attributes:
+        starts: Starts of the disjoint intervals, ns, (n,).
+        ends: Their ends, ns, (n,).
     """
 
     def __init__(self, starts: Values, ends: Values) -> None:
-        """Take intervals from `starts` to `ends`, each of shape (n,), in any order."""
+        """Form the union of intervals from `starts` to `ends`, ns, (m,), in any order."""
         order = np.argsort(starts, kind="stable")
         starts, ends = starts[order], np.maximum.accumulate(np.maximum(starts, ends)[order])
-        # An interval that begins after the end of all before it begins a new block.
+        # An interval that begins after the end of all earlier ones starts a new interval of the
+        # union.
         first = np.ones(len(starts), bool)
         first[1:] = starts[1:] > ends[:-1]
         self.starts = starts[first]
@@ -152,25 +174,25 @@ class Occupation:
 
     @classmethod
     def of(cls, rows: Rows) -> Occupation:
-        """Return when a task needed its core: from waking up to closing the cycle."""
+        """Return the times in which a task occupied its core, including wake-up and overhead."""
         half = overhead_ns(rows) // 2
         return cls(rows["start_ns"] - half, rows["end_ns"] + half)
 
     @classmethod
     def union(cls, many: Sequence[Occupation]) -> Occupation:
-        """Return the union of several."""
-        none = np.empty(0, np.int64)
+        """Return the union of several occupations."""
+        empty = np.empty(0, np.int64)
         return cls(
-            np.concatenate([none, *(each.starts for each in many)]),
-            np.concatenate([none, *(each.ends for each in many)]),
+            np.concatenate([empty, *(occupation.starts for occupation in many)]),
+            np.concatenate([empty, *(occupation.ends for occupation in many)]),
         )
 
     def within(self, starts: Values, ends: Values) -> Values:
-        """Return the occupied time in each interval from `starts` to `ends`, shape as given."""
+        """Return the occupied time in each interval from `starts` to `ends`, ns, of their shape."""
         return np.asarray(self._until(ends) - self._until(starts))
 
     def _until(self, times: Values) -> Values:
-        """Return the occupied time before each of `times`."""
+        """Return the occupied time before each of `times`, ns."""
         begun = np.searchsorted(self.starts, times, side="right")
         if not len(self.starts):
             return np.zeros(np.shape(times), np.int64)
@@ -180,13 +202,14 @@ class Occupation:
 
 
 def waking_ns(rows: Rows) -> Values:
-    """Return the processor time used between release and start, to wake up."""
+    """Return the processor time that each cycle used to wake up, before its start, ns."""
     return np.asarray(np.clip(_beyond_stamps(rows), 0, np.maximum(lateness_ns(rows), 0)))
 
 
 def overhead_ns(rows: Rows) -> int:
-    """Return the median processor time of waking up for a cycle and closing it; 0 where every cycle
-    was disturbed.
+    """Return the median processor time for waking up and for closing a cycle, ns.
+
+    0 if every cycle was disturbed.
     """
     beyond = _beyond_stamps(rows)
     undisturbed = beyond[beyond >= 0]
@@ -194,20 +217,23 @@ def overhead_ns(rows: Rows) -> int:
 
 
 def _beyond_stamps(rows: Rows) -> Values:
-    """Return processor time less the time from start to end: negative where others had the core
-    meanwhile.
-    """
+    """Return the processor time minus the time from start to end, ns. Negative after preemption."""
     return np.asarray(rows["processor_ns"] - lasted_ns(rows))
 
 
 def unit_times(rows: Rows, above: Occupation) -> Values:
-    """Return the processor time of each part of a cycle, shape (n, 4): C, R, X, W; of a planner 0,
-    reading, P, U.
+    """Return the processor time of each part of a cycle, ns, shape (n, 4).
 
-    `above` is when tasks of higher priority had the core: that is taken off the part in which they
-    ran. Where the sum still exceeds the processor time, because ordinary scheduling or the machine
-    interfered, the rest is taken off what parts take beyond their undisturbed time, then off all in
-    proportion.
+    The parts of an executor are C, R, X and W, those of a planner are nothing, reading, P and U.
+
+    If the parts exceed the processor time of the cycle, because ordinary scheduling or the machine
+    interfered, the excess is subtracted from what the parts took beyond their undisturbed times,
+    and the rest from all parts in proportion.
+
+    Args:
+        rows: Trace records of the task.
+        above: Times in which tasks of higher priority occupied the core. They are subtracted from
+            the parts in which they fell.
     """
     stamps = np.stack([rows[name] for name in STAMPS], axis=1)
     starts = stamps[:, :-1]
@@ -222,10 +248,10 @@ def unit_times(rows: Rows, above: Occupation) -> Values:
 
 
 def _undisturbed(parts: Values, processor_ns: Values) -> Values:
-    """Return the undisturbed time of each part, shape (4,).
+    """Return the undisturbed time of each part, ns, shape (4,).
 
-    A short part is undisturbed in many cycles. The longest may be disturbed in all of them: of it,
-    that is what the others leave of the processor time.
+    Short parts are undisturbed in many cycles. The longest part may be disturbed in all of them, so
+    it gets at most the processor time that the others leave.
     """
     usual = np.asarray(np.percentile(parts, UNDISTURBED, axis=0))
     longest = int(np.argmax(usual))
@@ -236,8 +262,9 @@ def _undisturbed(parts: Values, processor_ns: Values) -> Values:
 
 
 def _shared_out(total: Values, weights: Values) -> Values:
-    """Return `total`, shape (n,), distributed by `weights`, shape (n, 4), none more than its
-    weight.
+    """Distribute `total`, shape (n,), in proportion to `weights`, shape (n, 4).
+
+    No share exceeds its weight.
     """
     sums = weights.sum(axis=1)
     factor = np.divide(np.minimum(total, sums), sums, out=np.zeros(len(sums)), where=sums > 0)

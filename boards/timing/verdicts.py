@@ -1,12 +1,12 @@
-"""Verdicts: every equation of the timing model applied to every level, core and task of a rack.
+"""Verdicts: the equations of the timing model for every level, core and task of a rack.
 
-Equations 3.1 to 3.10 (NISTIR 90-4251, section 3) are judged as in the paper, each level as if it
-had its own processor. Response times and core loads account for levels that share a core.
+Equations 3.1 to 3.10 (NISTIR 90-4251, section 3) are judged as in the paper, where each level has
+its own processor. Response times and core loads account for levels that share a core.
 
-The paper's symbols: R_i is a level's response time, which is its cycle; R_max the longest cycle of
-all levels; t_exec the executor's processing in a cycle; t_comm its reading and writing, waiting
-included; t_residual the rest of the cycle; t_plan one plan with its update; d the cycles that a
-plan may take; t_cs one context switch.
+Symbols of the paper: R_i is the response time of a level, which is its cycle. R_max is the longest
+cycle of all levels. t_exec is the processing of the executor in a cycle, t_comm its reading and
+writing including waits, and t_residual the rest of the cycle. t_plan is one plan with its update, d
+the number of cycles that a plan may take, and t_cs one context switch.
 """
 
 from __future__ import annotations
@@ -30,16 +30,15 @@ _HOLDS: dict[Sign, Callable[[float, float], bool]] = {
     "=": operator.eq,
 }
 SYSTEM = "system"
-"""The subject of the system's response."""
+"""Subject of verdicts on the system response."""
 LOOSE_PLAN = "fig. 4"
-"""A loosely coupled planner's time slice: in the paper's text and its figure 4, without an equation
-number."""
+"""Criterion for a loosely coupled planner, which has no equation number in the paper."""
 PLAN_WITHIN = "plan within"
 RESPONSE_TIME = "response time"
 LOAD = "load"
 FRAMES = "frames"
 INBOX = "inbox"
-"""Criteria beyond the paper."""
+"""Criteria that are not in the paper."""
 EQUATIONS = "3.1", "3.2", "3.3", "3.4", "3.5", "3.6", "3.7", "3.8", LOOSE_PLAN, "3.9", "3.10"
 BEYOND = PLAN_WITHIN, RESPONSE_TIME, LOAD, FRAMES, INBOX
 ORDER = (*EQUATIONS, *BEYOND)
@@ -48,12 +47,17 @@ ORDER = (*EQUATIONS, *BEYOND)
 
 @dataclass(frozen=True)
 class EquationVerdict:
-    """Both sides of one equation for one subject; predicted or measured.
+    """Verdict of one equation for one subject, predicted or measured.
 
-    `equation` is the paper's number, as in "3.8", or one of `BEYOND`. `subject` is a board, a task,
-    a core or "system". `left` and `right` are ns, or numbers if `unit` is "1". `meaning` names both
-    sides in the paper's terms, as in "t_plan / d < t_residual - 2 t_cs". `endless` says in a
-    sentence why the left side has no bound; empty if it has one.
+    Attributes:
+        equation: Number in the paper, as in "3.8", or one of `BEYOND`.
+        subject: A board, a task, a core or "system".
+        left: Value of the left side, in `unit`.
+        sign: Relation that should hold between the sides.
+        right: Value of the right side, in `unit`.
+        meaning: Both sides in the paper's terms, as in "t_plan / d < t_residual - 2 t_cs".
+        unit: "ns", or "1" for pure numbers.
+        endless: Reason why the left side has no bound, as a clause. Empty if it has one.
     """
 
     equation: str
@@ -67,50 +71,51 @@ class EquationVerdict:
 
     @property
     def holds(self) -> bool:
-        """Whether the numbers satisfy the equation."""
+        """Whether the values satisfy the equation."""
         return _HOLDS[self.sign](self.left, self.right)
 
     @property
     def margin(self) -> float:
-        """Right side minus left side, in `unit`; negative if the equation fails."""
+        """Right side minus left side, in `unit`. Negative if an inequality fails."""
         return self.right - self.left
 
     @property
     def key(self) -> tuple[str, str, str]:
-        """Identity of the judgement, the same before and after a change of the rack."""
+        """Identity of the verdict, which a change of the rack's times does not affect."""
         return self.equation, self.subject, self.meaning
 
     def document(self) -> dict[str, Any]:
-        """Return everything as plain data; an infinite side is None."""
+        """Return the verdict as plain data, for JSON. An infinite side becomes None."""
         sides = {"left": self.left, "right": self.right, "margin": self.margin}
         finite = {name: side if isfinite(side) else None for name, side in sides.items()}
         return {**asdict(self), "holds": self.holds, **finite}
 
 
 def verdicts(rack: RackTiming) -> list[EquationVerdict]:
-    """Return the verdicts on everything that has a budget, in the order of the equations.
+    """Return all verdicts on a rack, in the order of the equations.
 
-    A response time without a bound is infinite.
+    Only what has a budget is judged. A response time without a bound is infinite.
     """
     levels = (level_verdicts(rack, level) for level in rack.levels.values())
     beyond = _of_tasks(rack), _of_cores(rack), _of_frames(rack), _of_inboxes(rack)
-    found = chain(system_verdicts(rack), *levels, *beyond)
-    return sorted(found, key=lambda verdict: ORDER.index(verdict.equation))
+    all_verdicts = chain(system_verdicts(rack), *levels, *beyond)
+    return sorted(all_verdicts, key=lambda verdict: ORDER.index(verdict.equation))
 
 
 def level_verdicts(rack: RackTiming, level: LevelTiming) -> Iterator[EquationVerdict]:
-    """Yield the verdicts on one level by itself."""
+    """Yield the verdicts on one level, as if it had its own processor."""
     yield from _of_cycle(level, rack.tick_ns)
     yield from _of_planner(level, rack.context_switch_ns, rack.small_share)
 
 
 def system_verdicts(rack: RackTiming) -> Iterator[EquationVerdict]:
-    """Yield the verdicts on the system's response, chain by chain; with a goal for it, also on
-    every cycle in them.
+    """Yield the verdicts on the system response along each chain of boards.
+
+    If the config has a goal for the response, the cycle of each board in a chain is judged too.
     """
     goal_ns = None if rack.response_goal_ns is None else rack.response_goal_ns / rack.speed
-    for found in rack.parallel:
-        yield from _of_chains(rack, found, goal_ns)
+    for chains in rack.parallel:
+        yield from _of_chains(rack, chains, goal_ns)
     if goal_ns is not None:
         for name in dict.fromkeys(chain(*rack.chains)):
             cycle_ns = rack.boards[name].every * rack.tick_ns
@@ -119,8 +124,9 @@ def system_verdicts(rack: RackTiming) -> Iterator[EquationVerdict]:
 
 
 def response_subject(rack: RackTiming, chains: ParallelChains) -> str:
-    """Return the subject of the system's response along these chains; where there are others, it
-    names them.
+    """Return the subject of verdicts on the system response along chains.
+
+    It contains their names if the rack has other chains too.
     """
     return SYSTEM if len(rack.parallel) == 1 else f"{SYSTEM}, {chains.text}"
 
@@ -151,7 +157,7 @@ def _of_cycle(level: LevelTiming, tick_ns: int) -> Iterator[EquationVerdict]:
     yield EquationVerdict("3.1", board, used, "<=", cycle, "t_proc + t_c <= R_i")
     longest = level.longest_cycle_ns
     yield EquationVerdict("3.4", board, level.execution_ns, "<", longest, "t_exec < R_max")
-    # A cycle too short for its parts has a residual of 0: they then exceed it.
+    # If a cycle is too short for its parts, the residual is 0 and the parts exceed the cycle.
     meaning = "t_exec + t_comm + t_residual = R_i"
     yield EquationVerdict("3.5", board, max(used, cycle), "=", cycle, meaning)
     yield EquationVerdict("3.6", board, 0, "<", level.residual_ns, "0 < t_residual <= alpha")
@@ -177,11 +183,11 @@ def _of_planner(level: LevelTiming, switch_ns: int, small: float) -> Iterator[Eq
     share = level.planning_ns / level.within_cycles
     left = level.residual_ns - 2 * switch_ns
     yield EquationVerdict("3.8", board, share, "<", left, "t_plan / d < t_residual - 2 t_cs")
-    # In the worst cycle the plan is updated, too.
-    talks = level.interlevel_ns + level.executor_planner_ns
-    taken = level.execution_ns + talks + 2 * switch_ns
+    # In the worst cycle the plan is also updated.
+    communication = level.interlevel_ns + level.executor_planner_ns
+    used = level.execution_ns + communication + 2 * switch_ns
     meaning = "t_exec + t_comm + 2 t_cs < R_i, leaving t_(plan+residual)"
-    yield EquationVerdict("3.9", board, taken, "<", cycle, meaning)
+    yield EquationVerdict("3.9", board, used, "<", cycle, meaning)
     update = level.executor_planner_ns / cycle
     meaning = "t_executor-planner / R_i, small"
     yield EquationVerdict("3.10", board, update, "<=", small, meaning, "1")
@@ -194,10 +200,10 @@ def _of_tasks(rack: RackTiming) -> Iterator[EquationVerdict]:
         if response_ns is None:
             response_ns = inf
             load = rack.loads[task.core]
-            what = "is overloaded" if load > 1 else "leaves it too little time"
+            state = "is overloaded" if load > 1 else "leaves it too little time"
             role = "planner" if task.task.endswith(".planner") else "board"
             endless = (
-                f"{role} '{task.task}' never finishes: core {task.core} {what} (load {load:.3g})"
+                f"{role} '{task.task}' never finishes: core {task.core} {state} (load {load:.3g})"
             )
         yield EquationVerdict(
             equation=RESPONSE_TIME,
@@ -217,13 +223,11 @@ def _of_cores(rack: RackTiming) -> Iterator[EquationVerdict]:
 
 
 def _of_frames(rack: RackTiming) -> Iterator[EquationVerdict]:
-    """Yield the verdicts on the places of a static schedule: one for all frames in which a place is
-    the same.
-    """
-    for alike in core_frames(rack):
-        for place in alike.places:
+    """Yield the verdicts on the places of a static schedule, one for all equal frames."""
+    for equal_frames in core_frames(rack):
+        for place in equal_frames.places:
             limit = f"'{place.until}' begins" if place.until else "the frame ends"
-            meaning = f"done before {limit}, in frame {alike.frames[0]}"
+            meaning = f"done before {limit}, in frame {equal_frames.frames[0]}"
             end_ns = place.limit_ns - place.slack_ns
             yield EquationVerdict(FRAMES, place.board, end_ns, "<=", place.limit_ns, meaning)
 

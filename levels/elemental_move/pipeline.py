@@ -24,16 +24,16 @@ class ElementalMoveParams(Table):
     """`[board.<name>.params]`: patience, grasping, and the answers from below."""
 
     patience: Positive = 60.0
-    """time that a move waits for a free path before it is an error, s"""
+    """time that a move waits for a free path before it is an error [s]"""
     retry: Positive = 2.0
-    """time after which a path is searched again although no body has moved, s"""
+    """time after which a path is searched again although no body has moved [s]"""
     replans: int = Field(10, ge=1, le=1000)
     """number of other paths that one move may try before a blocked path is an error"""
     grasp_gap: Positive | None = None
-    """a gripper closer to closed than this holds nothing, m or rad; default: a twentieth of its
+    """a gripper closer to closed than this holds nothing [m or rad]; default: a twentieth of its
     travel"""
     answer: Positive = 0.3
-    """time that settling and the report from below may take, s"""
+    """time that settling and the report from below may take [s]"""
 
 
 class PlanStore:

@@ -34,32 +34,32 @@ class PrimitiveParams(Table):
     """`[board.<name>.params]`: bounds of following, settling and guarding."""
 
     following: Positive = 0.05
-    """largest distance of a joint from its set point during motion, rad"""
+    """largest distance of a joint from its set point during motion [rad]"""
     straying: Positive = 0.1
-    """time that a joint may be farther than that before it is an error, s"""
+    """time that a joint may be farther than that before it is an error [s]"""
     settled: Positive = 0.003
-    """largest distance of a settled joint from its goal, rad"""
+    """largest distance of a settled joint from its goal [rad]"""
     settled_opening: Positive | None = None
-    """largest speed of a settled gripper, m/s or rad/s; default: a twentieth of its travel in a
+    """largest speed of a settled gripper [m/s or rad/s]; default: a twentieth of its travel in a
     second"""
     settled_cycles: int = Field(3, ge=1, le=100)
     """consecutive cycles within these bounds after which an arm counts as settled"""
     settling: Positive = 3.0
-    """longest time that arm or gripper may take to settle, s"""
+    """longest time that arm or gripper may take to settle [s]"""
     astray: Positive = 0.02
-    """largest distance of a joint from the path when motion begins, rad"""
+    """largest distance of a joint from the path when motion begins [rad]"""
     bridging: Positive = 0.5
-    """time in which such a distance is removed, s"""
+    """time in which such a distance is removed [s]"""
     silent: Positive = 10.0
-    """time without status from below, restarts included, after which it is an error, s"""
+    """time without status from below, restarts included, after which it is an error [s]"""
     blind: Positive = 0.2
-    """time without a new scene in the world model after which motion holds, s"""
+    """time without a new scene in the world model after which motion holds [s]"""
     braking: float = Field(1.5, ge=1.0, le=3.0)
     """multiple of the planned acceleration and jerk limits that a hold may use"""
     lookahead: Positive = 2.0
-    """time ahead of the arm that the guard checks in every cycle, s"""
+    """time ahead of the arm that the guard checks in every cycle [s]"""
     clear: Positive = 0.5
-    """time for which the path must be clear before held motion continues, s"""
+    """time for which the path must be clear before held motion continues [s]"""
 
 
 @dataclass(frozen=True)

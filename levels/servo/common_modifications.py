@@ -19,7 +19,7 @@ class DeadZoneParams(Table):
     """Parameters of `DeadZone`."""
 
     width: Positive
-    """position error up to which a joint counts as at its set point, rad"""
+    """position error up to which a joint counts as at its set point [rad]"""
 
 
 class DeadZone(Modification):
@@ -45,7 +45,7 @@ class JointPdParams(Table):
     """Parameters of `JointPd`."""
 
     bandwidth: Positive = Field(40.0, le=400.0)
-    """natural frequency of the error in every joint, rad/s"""
+    """natural frequency of the error in every joint [rad/s]"""
     damping: Positive = Field(1.0, le=3.0)
     """damping ratio of the error"""
     load: bool = True
@@ -80,7 +80,7 @@ class NotchParams(Table):
     """Parameters of `Notch`."""
 
     frequency: Positive
-    """frequency that is removed from the torque, Hz; below half the law's rate"""
+    """frequency that is removed from the torque [Hz]; below half the law's rate"""
     quality: Positive = Field(1.0, le=100.0)
     """frequency over the width of the notch"""
 

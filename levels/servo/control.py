@@ -26,7 +26,7 @@ class LoopGains(Table):
     """Gains of the joint loop."""
 
     bandwidth: Live[Positive] = Field(60.0, le=400.0)
-    """natural frequency of the error in every joint, rad/s"""
+    """natural frequency of the error in every joint [rad/s]"""
     damping: Live[Positive] = Field(1.0, le=3.0)
     """damping ratio of the error"""
 
@@ -40,7 +40,7 @@ class ArmParams(Table):
     """The class of the arm that a board drives, and the reactions to sensor and motor faults."""
 
     following: Positive = 0.02
-    """distance of a joint from its set point at which a motor counts as failed, rad"""
+    """distance of a joint from its set point at which a motor counts as failed [rad]"""
     on_sensor_fault: Reacting = "brake"
     """ramp to rest and hold, or ramp and brake, or brake; without known velocities always brake"""
     on_actuator_fault: Reacting = "brake"
@@ -48,9 +48,9 @@ class ArmParams(Table):
     good_cycles: int = Field(20, ge=1, le=10_000)
     """consecutive good cycles after which a fault is over"""
     retry: Positive = 0.5
-    """time after which a motor that gave too little is retried, or a struck arm resumes, s"""
+    """time after which a motor that gave too little is retried, or a struck arm resumes [s]"""
     patience: Positive = 5.0
-    """time for which faults may keep the arm from its set points before they are latched, s"""
+    """time for which faults may keep the arm from its set points before they are latched [s]"""
     arm: str = "rack.levels.arm:SimulatedArm"
     """class of the arm, package.module:Class; see rack.levels.arm.Arm"""
 

@@ -177,7 +177,7 @@ class ModifiableParams(Table):
     modifications: dict[ModificationName, ModificationConfig] = {}
     """control modifications by name, in the order in which they act"""
     transfer: Positive = Field(0.05, le=10.0)
-    """time in which the torque changes over after a modification is switched, s"""
+    """time in which the torque changes over after a modification is switched [s]"""
 
     @field_validator("modifications")
     @classmethod

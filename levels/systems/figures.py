@@ -43,9 +43,9 @@ class FigureParams(Table):
     """
 
     process_ms: Milliseconds | Annotated[tuple[Milliseconds, ...], Parameter(min_length=1)] = 2.0
-    """X: time of the executor in a cycle, ms; a list is repeated, one entry per cycle"""
+    """X: time of the executor in a cycle [ms]; a list is repeated, one entry per cycle"""
     plan_ms: Milliseconds = 6.0
-    """P: one plan, without its update, ms"""
+    """P: one plan, without its update [ms]"""
 
 
 class FigureLoop(Executor):

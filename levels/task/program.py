@@ -20,7 +20,7 @@ class Action(Table):
     """Base class of all actions."""
 
     by: Positive | None = None
-    """simulated time by which the action must be done, s"""
+    """simulated time by which the action must be done [s]"""
 
 
 class Transfer(Action):
@@ -31,11 +31,11 @@ class Transfer(Action):
     object: str
     """object of the scene"""
     to: Vector
-    """final position of the object's origin, m"""
+    """final position of the object's origin [m]"""
     yaw: Finite | None = None
-    """final angle of the object's x axis, rad; free if not given"""
+    """final angle of the object's x axis [rad]; free if not given"""
     lift: Positive = 0.1
-    """height of the straight motion above grasp and release, m"""
+    """height of the straight motion above grasp and release [m]"""
 
     def __str__(self) -> str:
         return f"transfer {self.object} to {list(self.to)}"
@@ -47,14 +47,14 @@ class Goto(Action):
     do: Literal["goto"] = "goto"
     """the kind of action"""
     position: Vector | None = None
-    """of the tool, m"""
+    """of the tool [m]"""
     quaternion: tuple[Finite, Finite, Finite, Finite] | None = None
     """of the tool, as w, x, y, z"""
     direction: Vector | Literal["any"] | None = None
     """of the tool's z axis, with any turn about it; default: down; with 'any' the orientation is
     free, as an arm with fewer than six joints reaches most places in few orientations"""
     joints: tuple[Finite, ...] | None = None
-    """joint positions, rad"""
+    """joint positions [rad]"""
 
     @model_validator(mode="after")
     def _one_goal(self) -> Goto:
@@ -117,14 +117,14 @@ class TaskParams(Table):
     """
 
     beginning: Positive = 0.1
-    """longest time from a segment's arrival at the primitive level to motion, s"""
+    """longest time from a segment's arrival at the primitive level to motion [s]"""
     settling: Positive = 0.2
-    """longest time from the end of a motion to the report that it is done, s"""
+    """longest time from the end of a motion to the report that it is done [s]"""
     gripping: Positive = 0.6
-    """longest time for the gripper to open or close and to settle, s"""
+    """longest time for the gripper to open or close and to settle [s]"""
     stalled_s: Positive = 90.0
     """time without any progress after which the task ends, unless an operator holds it; longer than
-    the patience of the level below, s"""
+    the patience of the level below [s]"""
 
 
 read_program = TaskConfig.read

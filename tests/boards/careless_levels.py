@@ -15,7 +15,7 @@ class CarelessParams(Table):
     """What the level does wrong."""
 
     torques: tuple[float, ...] = ()
-    """torque of j3 in the cycles from tick `first` on, one each, N m; any other holds it"""
+    """torque of j3 in the cycles from tick `first` on, one each [N m]; any other holds it"""
     first: int = 50
     thrown: bool = False
     """at tick 50, the arm is faster than its limits"""

@@ -182,7 +182,7 @@ def test_a_planner_takes_every_request_between_its_plans(config: MakeConfig) -> 
         ),
         (
             ("protocol.depth={ 'upper.status' = 3 }",),
-            "not a queue: it holds one message; queues: upper.requests",
+            "it is not a queue and holds one message; queues: upper.requests",
         ),
         (("protocol.depth={ 'upper.nothing' = 3 }",), "no such mailbox"),
         (("protocol.depth={ 'upper.requests' = 0 }",), "protocol.depth"),

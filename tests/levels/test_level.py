@@ -19,9 +19,9 @@ from rack.levels.tables import Finite, Live, Positive, Table
 
 class Gains(Table):
     gain: Live[Positive] = 2.0
-    """of the loop, 1/s"""
+    """of the loop [1/s]"""
     offset: Finite = 0.0
-    """of the sensor, rad"""
+    """of the sensor [rad]"""
 
 
 class Tuned(Executor):

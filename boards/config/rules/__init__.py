@@ -1,9 +1,8 @@
-"""The rules that the tables of a config keep between them, a file a subject: functions from the
-wiring to mistakes.
+"""Rules between the tables of a config: functions that take the wiring and yield mistakes.
 
-All mistakes are reported at once. A rule skips what depends on a broken table, whose own mistakes
-are already reported. Faults and commands, which may come live too, have rules of their own:
-`rack.boards.config.injections` and `rack.boards.config.commands`.
+All mistakes are reported at once. A rule skips everything that depends on a broken table, because
+the mistakes of that table are already reported. `rack.boards.config.injections` and
+`rack.boards.config.commands` check faults and commands, which may also come while a rack runs.
 """
 
 from __future__ import annotations
@@ -18,18 +17,17 @@ from rack.boards.config.schema import RackConfig
 from rack.boards.errors import Mistake, Mistakes
 
 NETWORK = "rack.boards.config.rules.lan"
-"""The rules of `[adapter.lan]`, by name: a rack without a network loads neither them nor what they
-know of certificates."""
+"""Module with the rules of `[adapter.lan]`. Only a rack with a network loads it."""
 
 
 def network_rules(config: RackConfig) -> ModuleType | None:
-    """Return the module with the rules of a rack's network; None for a rack without one."""
+    """Return the module with the network rules. None for a rack without a network."""
     return None if config.adapter.lan is None else import_module(NETWORK)
 
 
 def _network(wiring: Wiring) -> Mistakes:
     if (rules := network_rules(wiring.config)) is not None:
-        yield from rules.network(wiring, wiring.config.adapter.lan)
+        yield from rules.check_network(wiring, wiring.config.adapter.lan)
 
 
 Rule = Callable[[Wiring], Mistakes]
@@ -64,7 +62,7 @@ RULES: tuple[Rule, ...] = (
     levels.programs,
     levels.cell,
 )
-"""Every rule, in the order in which mistakes are listed."""
+"""All rules, in the order in which their mistakes are listed."""
 NEEDS: Mapping[Rule, set[str]] = {
     levels.scene: {"scene"},
     levels.robot: {"robot"},
@@ -75,10 +73,10 @@ NEEDS: Mapping[Rule, set[str]] = {
     boards.schedule: {"clock"},
     levels.programs: {"robot", "scene", "task"},
 }
-"""The tables without which a rule says nothing."""
+"""Tables that a rule depends on. The rule is skipped if one of them is broken."""
 
 
 def broken_rules(wiring: Wiring) -> list[Mistake]:
-    """Return every mistake in a wiring."""
-    kept = (rule for rule in RULES if not wiring.broken & NEEDS.get(rule, set()))
-    return [mistake for rule in kept for mistake in rule(wiring)]
+    """Return the mistakes that all applicable rules find in a wiring."""
+    rules = (rule for rule in RULES if not wiring.broken & NEEDS.get(rule, set()))
+    return [mistake for rule in rules for mistake in rule(wiring)]

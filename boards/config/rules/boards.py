@@ -1,6 +1,4 @@
-"""Boards and host boards: names, neighbours, planners and slots; their rates, the clock, and a
-static schedule.
-"""
+"""Rules for boards and host boards: names, neighbours, planners, slots, rates and schedule."""
 
 from __future__ import annotations
 
@@ -27,13 +25,13 @@ from rack.boards.config.timing import PLANNER_BUDGET, frames
 from rack.boards.errors import Mistake, Mistakes
 
 RESERVED = (CLOCK, "above", "below", "own")
-"""Names with a special meaning in the wiring of ports."""
+"""Names that no board may have, because they have a meaning in the wiring of ports."""
 PLANNER_TRANSFER = ("exchange_ms", "update_ms")
 BOARD_NAME = re.compile(r"[a-z][a-z0-9_]{0,30}")
 
 
 def boards(wiring: Wiring) -> Mistakes:
-    """Check the name, the neighbours and the planner of each board."""
+    """Check names, neighbours and planners of the boards."""
     known = [*wiring.config.board, *wiring.broken_boards]
     for name, board in wiring.config.board.items():
         place = f"board.{name}"
@@ -43,44 +41,44 @@ def boards(wiring: Wiring) -> Mistakes:
             yield from _neighbours(f"{place}.{key}", neighbours, others, "other board")
         yield from _planner(place, board)
         if board.executor == LAN_ADAPTER and (name != LAN or wiring.config.adapter.lan is None):
-            why = "permitted: [adapter.lan], which makes its board"
+            why = "this class needs the table [adapter.lan], which adds its board"
             yield Mistake(f"{place}.executor", board.executor, why)
 
 
 def hosts(wiring: Wiring) -> Mistakes:
-    """Check the name and the neighbours of each host board."""
+    """Check names and neighbours of the host boards."""
     known = [*wiring.config.board, *wiring.broken_boards]
     for name, host in wiring.config.host.items():
         place = f"host.{name}"
         yield from _name(place, name)
         if name in known:
-            yield Mistake(place, None, f"board.{name} has this name already")
+            yield Mistake(place, None, f"board.{name} already has this name")
         yield from _neighbours(f"{place}.below", host.below, known, "board")
 
 
-def _neighbours(place: str, names: Sequence[str], boards: Sequence[str], what: str) -> Mistakes:
+def _neighbours(place: str, names: Sequence[str], boards: Sequence[str], noun: str) -> Mistakes:
+    """Check that the neighbours listed at a place exist; `noun` says in a mistake what they are."""
     for name in names:
         if name not in boards:
             yield Mistake(
-                place, name, f"no {what} has this name; boards: {', '.join(boards) or 'none'}"
+                place, name, f"no {noun} has this name; boards: {', '.join(boards) or 'none'}"
             )
     yield from repeated(place, names)
 
 
 def _name(place: str, name: str) -> Mistakes:
     if not BOARD_NAME.fullmatch(name) or name in RESERVED:
-        why = f"permitted: a-z, 0-9 and _, at most 31, except {', '.join(RESERVED)}"
+        why = f"valid: at most 31 of a-z, 0-9 and _, except {', '.join(RESERVED)}"
         yield Mistake(place, None, f"invalid name for a board; {why}")
 
 
 def _planner(place: str, board: BoardConfig) -> Mistakes:
+    """Check that the keys for a planner fit its coupling, or are absent without a planner."""
     has_planner = board.planner is not None
     is_loose = board.coupling == "loose"
     if has_planner != (board.coupling != "none"):
-        permitted = (
-            '"tight" or "loose" with a planner' if has_planner else '"none" without a planner'
-        )
-        yield Mistake(f"{place}.coupling", board.coupling, f"permitted: {permitted}")
+        valid = '"tight" or "loose" with a planner' if has_planner else '"none" without a planner'
+        yield Mistake(f"{place}.coupling", board.coupling, f"must be {valid}")
     if is_loose and board.planner_slot is None:
         yield Mistake(
             f"{place}.planner_slot", None, "missing; a loosely coupled planner has its own board"
@@ -97,7 +95,7 @@ def _planner(place: str, board: BoardConfig) -> Mistakes:
         )
         yield Mistake(f"{place}.planner_priority", board.planner_priority, why)
     if not has_planner:
-        # Otherwise such a time would be ignored silently.
+        # These times would be ignored silently.
         for table, keys in (("budget", PLANNER_BUDGET), ("transfer", PLANNER_TRANSFER)):
             for key in keys:
                 if value := getattr(getattr(board, table), key, None):
@@ -109,7 +107,7 @@ def _planner(place: str, board: BoardConfig) -> Mistakes:
 
 
 def circles(wiring: Wiring) -> Mistakes:
-    """Find a circle among levels: a walk from level to level would not end."""
+    """Report a circle among the levels, which would have no highest or lowest level."""
     config = wiring.config
     links = list(config.links())
     try:
@@ -119,7 +117,7 @@ def circles(wiring: Wiring) -> Mistakes:
     except CycleError as error:
         circle = error.args[1][:-1]
         pairs = list(zip(circle, [*circle[1:], circle[0]], strict=True))
-        # The link that only one of its boards names is the likely mistake.
+        # The likely mistake is a link that only one of its two boards names.
         upper, lower = min(reversed(pairs), key=lambda link: len(_named_by(config, *link)))
         board, key, end = _named_by(config, upper, lower)[0]
         at = circle.index(lower)
@@ -130,8 +128,11 @@ def circles(wiring: Wiring) -> Mistakes:
 
 
 def _named_by(config: RackConfig, upper: str, lower: str) -> list[tuple[str, str, str]]:
-    """Return board and key of every table that puts one board above another, and the end of a
-    hierarchy without it.
+    """Return where the config puts board `upper` above board `lower`.
+
+    Returns:
+        For each such place: the board, its key, and the level ("lowest" or "highest") that has no
+        such key.
     """
     tables = ((upper, "below", "lowest", lower), (lower, "above", "highest", upper))
     return [
@@ -142,19 +143,19 @@ def _named_by(config: RackConfig, upper: str, lower: str) -> list[tuple[str, str
 
 
 def slots(wiring: Wiring) -> Mistakes:
-    """Check that each slot holds one board."""
+    """Check that no two boards have the same slot."""
     taken: dict[int, str] = {}
     for name, board in wiring.config.board.items():
         for key, slot in (("slot", board.slot), ("planner_slot", board.planner_slot)):
             place = f"board.{name}.{key}"
             if slot is not None and slot in taken:
-                yield Mistake(place, slot, f"already taken by {taken[slot]}")
+                yield Mistake(place, slot, f"the slot is already taken by {taken[slot]}")
             elif slot is not None:
                 taken[slot] = place
 
 
 def ends(wiring: Wiring) -> Mistakes:
-    """Check that no more than one board ends the run."""
+    """Check that at most one board ends the run."""
     ending = [name for name, board in wiring.config.board.items() if board.ends_run]
     for name in ending[1:]:
         yield Mistake(
@@ -165,20 +166,22 @@ def ends(wiring: Wiring) -> Mistakes:
 
 
 def record(wiring: Wiring) -> Mistakes:
-    """Check that a recording which keeps everything is not asked for what surrounds a fault."""
+    """Check that `before` and `after` are given only for a flight recorder."""
     table = wiring.config.record
     if table.keep is None:
         for key in ("before", "after"):
             if (value := getattr(table, key)) != RecordConfig.model_fields[key].default:
-                yield Mistake(f"record.{key}", value, "needs record.keep; without it all is kept")
+                yield Mistake(
+                    f"record.{key}", value, "this needs record.keep; without it everything is kept"
+                )
 
 
 LONGEST_MAJOR = 10_000
-"""Longest major frame, ticks: the timing model computes two of them."""
+"""Longest major frame, ticks. The timing model simulates two major frames."""
 
 
 def clock(wiring: Wiring) -> Mistakes:
-    """Check the tick in simulated time and in real time."""
+    """Check the length of a tick in simulated time and in real time."""
     config = wiring.config
     clock = wiring.config.clock
     if abs(clock.period_ms * 1e6 - config.clock_ns) > 1e-3:
@@ -192,21 +195,20 @@ def clock(wiring: Wiring) -> Mistakes:
     tick_ms = clock.period_ms / clock.speed
     if tick_ms < SHORTEST_MS:
         why = (
-            f"a tick would take {tick_ms:g} ms of real time; permitted: {SHORTEST_MS:g} ms or more"
+            f"a tick would take {tick_ms:g} ms of real time; it must take {SHORTEST_MS:g} ms or"
+            " more"
         )
         yield Mistake("clock.speed", clock.speed, why)
 
 
 def rates(wiring: Wiring) -> Mistakes:
-    """Check that the period of each board is given once, is on the clock's grid, and is not too
-    long.
-    """
+    """Check that each board's period is given once, is a multiple of ticks, and is not too long."""
     for name, board in wiring.config.board.items():
         place = f"board.{name}.rate_hz"
         if (board.rate_hz is None) == (board.every is None):
             why = "missing; give rate_hz (Hz) or every (ticks)"
             if board.every is not None:
-                why = "every is also given; permitted: one of rate_hz, every"
+                why = "every is also given; give only one of rate_hz, every"
             yield Mistake(place, board.rate_hz, why)
             continue
         try:
@@ -218,53 +220,54 @@ def rates(wiring: Wiring) -> Mistakes:
             yield Mistake(
                 place,
                 board.rate_hz,
-                f"a cycle would take {every} ticks; permitted: up to {LONGEST_EVERY}",
+                f"a cycle would take {every} ticks; it can take up to {LONGEST_EVERY}",
             )
         if board.phase >= every:
-            why = f"must be less than the board's period; permitted: 0 to {every - 1} ticks"
+            why = f"must be less than the board's period: 0 to {every - 1} ticks"
             yield Mistake(f"board.{name}.phase", board.phase, why)
 
 
 def polling(wiring: Wiring) -> Mistakes:
-    """Refuse a board that busy-waits on a shared core: at a real-time priority it would starve the
-    others.
+    """Check that a board that busy-waits has a core to itself.
+
+    At a real-time priority it would starve all other processes on its core.
     """
     config = wiring.config
     cores = {CLOCK: config.clock.core} | {place.name: place.core for place in config.tasks()}
     for name, board in config.board.items():
         others = [other for other, core in cores.items() if core == board.core and other != name]
         if (board.wake or config.clock.wake) == "poll" and others:
-            why = f"needs a core of its own, but shares core {board.core} with: {', '.join(others)}"
+            why = f"polling needs a core to itself; core {board.core} also runs {', '.join(others)}"
             yield Mistake(f"board.{name}.wake", "poll", why)
 
 
 def reservations(wiring: Wiring) -> Mistakes:
-    """Check that each board can reserve processor time, if the clock's scheduler needs that."""
+    """Check that each board can reserve processor time under earliest deadline first."""
     config = wiring.config
     if config.clock.scheduler == "fixed-priority":
         return
     if not config.timing.clock_ms:
-        yield Mistake("timing.clock_ms", 0.0, "missing; the clock reserves twice as much")
+        yield Mistake("timing.clock_ms", 0.0, "missing; the clock reserves twice this time")
     for name, board in config.board.items():
         place = f"board.{name}"
         if not board.busy_ms:
-            yield Mistake(f"{place}.budget", None, "missing; the board reserves twice as much")
+            yield Mistake(f"{place}.budget", None, "missing; the board reserves twice its budget")
         if (board.wake or config.clock.wake) == "poll":
-            yield Mistake(f"{place}.wake", "poll", "busy-waiting uses up what it reserves")
+            yield Mistake(f"{place}.wake", "poll", "busy-waiting uses up the reserved time")
         if board.coupling == "tight":
-            why = "its planner's update takes the executor's priority, which reservations precede"
+            why = "a planner with the executor's priority would run below all reservations"
             yield Mistake(f"{place}.coupling", "tight", why)
         if board.executor == LAN_ADAPTER:
-            why = "not with a network, whose threads need the adapter's priority"
+            why = "the network adapter's threads need its priority; use fixed-priority"
             yield Mistake("clock.scheduler", config.clock.scheduler, why)
 
 
 def schedule(wiring: Wiring) -> Mistakes:
-    """Check a static schedule; its boards only if its frames are right."""
+    """Check the frames of a static schedule and, if they are valid, the cycles of the boards."""
     table = wiring.config.schedule
     if table is not None:
-        found = list(_frames(table, wiring.config.clock_ns))
-        yield from found or _cycles(wiring, table)
+        mistakes = list(_frames(table, wiring.config.clock_ns))
+        yield from mistakes or _cycles(wiring, table)
 
 
 def _frames(table: ScheduleConfig, clock_ns: int) -> Mistakes:
@@ -281,17 +284,21 @@ def _frames(table: ScheduleConfig, clock_ns: int) -> Mistakes:
         why = f"not a multiple of minor_ms, {table.minor_ms:g} ms; nearest: {near} ms"
         yield Mistake("schedule.major_ms", table.major_ms, why)
     elif major > LONGEST_MAJOR:
-        why = f"{major} ticks; permitted: up to {LONGEST_MAJOR}, {LONGEST_MAJOR * tick_ms:g} ms"
+        why = (
+            f"{major} ticks are too long; the longest major frame is {LONGEST_MAJOR} ticks,"
+            f" {LONGEST_MAJOR * tick_ms:g} ms"
+        )
         yield Mistake("schedule.major_ms", table.major_ms, why)
 
 
 def _nearest(value: float, step: float) -> str:
-    """Return the multiples of `step` next to a value that is none."""
+    """Return the multiples of `step` next to a value that is not one, as text."""
     below = int(value / step)
     return " or ".join(f"{number * step:.12g}" for number in (below, below + 1) if number)
 
 
 def _cycles(wiring: Wiring, table: ScheduleConfig) -> Mistakes:
+    """Check that the cycle of each board fits the frames."""
     clock_ns = wiring.config.clock_ns
     minor, major = frames(table, clock_ns)
     tick_ms = clock_ns * 1e-6
@@ -311,8 +318,8 @@ def _cycles(wiring: Wiring, table: ScheduleConfig) -> Mistakes:
             for cycle in (*below[-1:], *above[:1])
         )
         why = (
-            f"a cycle of {every * tick_ms:g} ms does not fit the schedule, a multiple of the minor"
-            f" frame, {table.minor_ms:g} ms, that divides the major one, {table.major_ms:g} ms;"
-            f" nearest: {rates}"
+            f"a cycle of {every * tick_ms:g} ms does not fit the schedule; it must be a multiple of"
+            f" the minor frame, {table.minor_ms:g} ms, that divides the major frame,"
+            f" {table.major_ms:g} ms; nearest: {rates}"
         )
         yield Mistake(f"board.{name}.{key}", getattr(board, key), why)

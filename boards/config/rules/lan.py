@@ -1,7 +1,7 @@
-"""`[adapter.lan]`: what is exchanged with other racks, and how safely; where mistakes of its board
-are shown.
+"""Rules for `[adapter.lan]`: exchanges with other racks, endpoints and certificates.
 
-The table makes a board, `lan`, which is checked like any other. A user knows it as `adapter.lan`.
+The table adds a board, `lan`, which is checked like any other. `move_to_adapter` moves its mistakes
+to `adapter.lan`, the place that the user wrote.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from rack.levels.peer import peer_port
 PLACE = "adapter.lan"
 ITSELF = f"board.{LAN}"
 INSTALL = "an exchange with other racks needs eclipse-zenoh: pip install 'nasrem-rack[lan]'"
-SLOWER = "over a network goes what the task and elemental-move levels exchange"
+SLOWER = "export the slower mailboxes of the task and elemental-move levels"
 _OWN = re.compile(rf"\bboard\.{LAN}(\.params)?(?=[.\[]|\b)")
 _MAILBOX = f"mailbox {LAN}."
 
 
-def network(wiring: Wiring, table: LanConfig) -> Mistakes:
-    """Check the table, and what it names."""
+def check_network(wiring: Wiring, table: LanConfig) -> Mistakes:
+    """Check the table `[adapter.lan]` and everything that it names."""
     yield from _endpoints(table)
     if is_taken(wiring.config):
-        why = f"[{PLACE}] makes the board of this name; rename the board, or leave one out"
+        why = f"[{PLACE}] adds a board of this name; rename this board, or remove one of them"
         yield Mistake(ITSELF, None, why)
     else:
         yield from _board(wiring, table)
@@ -63,19 +63,21 @@ def _board(wiring: Wiring, table: LanConfig) -> Mistakes:
         yield from _priority(config, table)
         if config.protocol.strict:
             why = (
-                "what other racks send makes a run depend on timing, refused by protocol.strict ="
-                " true"
+                "messages of other racks make a run depend on timing, which protocol.strict = true"
+                ' refuses; clock.mode must be "lockstep"'
             )
-            yield Mistake(PLACE, None, f'{why}; permitted: clock.mode = "lockstep"')
+            yield Mistake(PLACE, None, why)
 
 
 def _names(table: LanTable, rack: str) -> Mistakes:
-    """Check names of racks and ports: none twice, none of this rack, none that the adapter itself
-    needs.
+    """Check the names of racks and ports.
+
+    No mailbox may be listed twice, no rack may be this one, and no port may have a name under
+    which the adapter itself writes a mailbox.
     """
     taken = {
         STATUS: "its status",
-        **{peer_port(other): f"what it knows of rack '{other}'" for other in table.racks},
+        **{peer_port(other): f"the state of rack '{other}'" for other in table.racks},
     }
     for port, entry in table.imports.items():
         place = f"{PLACE}.import.{port}"
@@ -87,7 +89,7 @@ def _names(table: LanTable, rack: str) -> Mistakes:
             yield Mistake(
                 f"{place}.from",
                 entry.source,
-                "a mailbox of this rack itself: levels here read it directly",
+                "this mailbox belongs to this rack, whose levels can read it directly",
             )
     for key, entries in (("export", table.exports), ("import", table.imports)):
         for source, count in repeats(entry.source for entry in entries.values()):
@@ -95,23 +97,30 @@ def _names(table: LanTable, rack: str) -> Mistakes:
             yield Mistake(
                 f"{PLACE}.{key}",
                 source,
-                f"listed {count} times: {ports}; any number of levels may read",
+                f"listed {count} times: {ports}; any number of levels may read one port",
             )
     if rack in table.peers:
-        yield Mistake(f"{PLACE}.peers", rack, "the name of this rack itself")
+        yield Mistake(f"{PLACE}.peers", rack, "this is the name of this rack itself")
     for port, _ in repeats(map(peer_port, table.racks)):
-        alike = [other for other in table.racks if peer_port(other) == port]
+        equivalent = [other for other in table.racks if peer_port(other) == port]
         why = (
-            f"these names differ in '-' and '_' alone, so their mailboxes {LAN}.{port} are one;"
+            f"these names differ only in '-' and '_', so they would share mailbox {LAN}.{port};"
             " rename a rack"
         )
-        yield Mistake(f"{PLACE}.peers", alike, why)
+        yield Mistake(f"{PLACE}.peers", equivalent, why)
 
 
 def _rate(place: str, entry: ExportConfig | ImportConfig, cycle_ns: int) -> Mistakes:
-    of = ("of the adapter", "cycle")
+    """Check the rate of an exchange and, for an import, the longest permitted age of a message.
+
+    Args:
+        place: Place of the entry in the config.
+        entry: The exchange.
+        cycle_ns: Period of the adapter's board, ns of simulated time.
+    """
+    grid = ("of the adapter", "cycle")
     try:
-        every = ticks_of(entry.rate_hz, cycle_ns, "exchange", of, FASTEST_HZ)
+        every = ticks_of(entry.rate_hz, cycle_ns, "exchange", grid, FASTEST_HZ)
     except ClockError as error:
         yield Mistake(f"{place}.rate_hz", entry.rate_hz, str(error))
         return
@@ -119,15 +128,16 @@ def _rate(place: str, entry: ExportConfig | ImportConfig, cycle_ns: int) -> Mist
         least_ms = (every + 1) * cycle_ns * 1e-6
         if entry.max_age_ms < least_ms:
             why = (
-                "between two exchanges it gets as old as one of them and a cycle of the adapter,"
-                f" {least_ms:.12g} ms"
+                "between two exchanges a message gets as old as their interval and one cycle of"
+                f" the adapter; must be at least {least_ms:.12g} ms"
             )
-            yield Mistake(f"{place}.max_age_ms", entry.max_age_ms, f"{why}; permitted: no less")
+            yield Mistake(f"{place}.max_age_ms", entry.max_age_ms, why)
 
 
 def _priority(config: RackConfig, table: LanConfig) -> Mistakes:
-    """Require a priority above the neighbours', if there are real-time ones: else others lose sight
-    of this rack.
+    """Check that the adapter has a higher priority than real-time boards on its core.
+
+    They could delay its signs of life, and other racks would take this one for lost.
     """
     others = [place for place in config.tasks() if place.core == table.core and place.board != LAN]
     above = [
@@ -136,31 +146,32 @@ def _priority(config: RackConfig, table: LanConfig) -> Mistakes:
         if place.priority >= max(1, table.priority)
     ]
     if above:
-        why = f"must be above that of the other boards on core {table.core}, {', '.join(above)}"
-        yield Mistake(
-            f"{PLACE}.priority", table.priority, f"{why}: else they keep it from its signs of life"
+        why = (
+            f"must be above the other boards on core {table.core}, {', '.join(above)}; otherwise"
+            " they can delay its signs of life"
         )
+        yield Mistake(f"{PLACE}.priority", table.priority, why)
 
 
 def _export(wiring: Wiring, source: str) -> Iterator[str]:
-    """Yield why a mailbox cannot be exported. A queue is found with the other queues."""
+    """Yield why a mailbox cannot be exported. The rule for queues reports exported queues."""
     board = source.partition(".")[0]
     if board == LAN:
-        yield "written by the adapter itself; permitted: mailboxes that levels write"
+        yield "the adapter itself writes it; only mailboxes of levels can be exported"
     elif source in wiring.operated:
-        yield "what an operator commands stays in its rack; permitted: mailboxes that levels write"
+        yield "operator commands stay in their rack; only mailboxes of levels can be exported"
     elif not wiring.is_known(source):
         yield f"no such mailbox; mailboxes: {wiring.names}"
     elif source in wiring.writers and board in wiring.every:
         every = wiring.every[board] * wiring.writers[source][1].cycles
         rate_hz = 1e9 / (every * wiring.config.clock_ns)
         if rate_hz > FASTEST_HZ * (1 + 1e-9):
-            why = f"written at {rate_hz:g} Hz, and a loop that fast must not wait for a network"
-            yield f"{why}; permitted: up to {FASTEST_HZ:g} Hz: {SLOWER}"
+            why = f"written at {rate_hz:g} Hz, too fast for a loop over a network, which can run at"
+            yield f"{why} up to {FASTEST_HZ:g} Hz; {SLOWER}"
 
 
-def at_adapter(mistake: Mistake, config: RackConfig) -> Mistake:
-    """Return a mistake of the adapter's board with the place that its user knows."""
+def move_to_adapter(mistake: Mistake, config: RackConfig) -> Mistake:
+    """Return a mistake with places on the adapter's board changed to places in `[adapter.lan]`."""
     table = config.adapter.lan
     if table is None or mistake.place == ITSELF:
         return mistake
@@ -174,11 +185,11 @@ def at_adapter(mistake: Mistake, config: RackConfig) -> Mistake:
 
 
 SOON = timedelta(days=30)
-"""Time before the end of certificates from which a launch warns."""
+"""A launch warns about certificates that expire within this time."""
 
 
 def _endpoints(table: LanTable) -> Mistakes:
-    """Check the endpoints, judged by the config alone."""
+    """Check endpoints and their protection as far as the config alone determines them."""
     for key in ("listen", "connect"):
         for at, text in enumerate(getattr(table, key)):
             try:
@@ -188,26 +199,27 @@ def _endpoints(table: LanTable) -> Mistakes:
             if why:
                 yield Mistake(f"{PLACE}.{key}[{at}]", text, why)
     if table.estop_from and (exposed := _open(table)):
-        could = "pass for any of them"
+        attack = "impersonate any of these racks"
         if table.certificates is not None:
-            could = "repeat what one of them has asked"
-        why = f"whoever reaches {exposed[0]} could {could}; permitted: tls/ or quic/ with"
+            attack = "repeat an earlier request of one of these racks"
+        why = f"whoever reaches {exposed[0]} could {attack}; use tls/ or quic/ with"
         yield Mistake(
             f"{PLACE}.estop_from",
             ", ".join(table.estop_from),
             f"{why} certificates (rack lan certificates --help), or unix/ on one machine",
         )
     if has_tls(table) and table.certificates is None:
-        why = "missing; TLS needs them: see rack lan certificates --help"
+        why = "missing; TLS needs certificates: see rack lan certificates --help"
         yield Mistake(f"{PLACE}.certificates", None, why)
     if has_tls(table) and table.exports and not table.racks:
-        why = "missing; with TLS only racks that it names may import from this one"
+        why = "missing; with TLS only racks listed here may import from this one"
         yield Mistake(f"{PLACE}.peers", None, why)
 
 
 def _open(table: LanTable) -> list[str]:
-    """Return the endpoints that others reach without a certificate: every user of this machine
-    reaches those of loopback.
+    """Return the endpoints that others can reach without a certificate.
+
+    These include loopback addresses, which every user of this machine can reach.
     """
     return [str(end) for end in endpoints_of(table) if not (end.has_tls or end.is_private)]
 
@@ -215,31 +227,31 @@ def _open(table: LanTable) -> list[str]:
 def _why_not(endpoint: Endpoint, table: LanTable, connects: bool) -> str:
     if endpoint.has_tls and connects and ":" in endpoint.host:
         return (
-            "zenoh checks no certificate for an address of IPv6; permitted: a host name, or an"
-            " address of IPv4"
+            "zenoh does not check certificates of IPv6 addresses; use a host name or an IPv4"
+            " address"
         )
     if not endpoint.has_tls and has_tls(table):
         return (
-            "without TLS, which others have: who comes here is not known; permitted: all with TLS,"
-            " or none"
+            "this endpoint has no TLS but others have it, so its peers are not authenticated; use"
+            " TLS for all endpoints or for none"
         )
     if endpoint.has_tls or endpoint.is_private or table.insecure:
         return ""
     if not endpoint.is_loopback:
         return (
-            "beyond this machine without TLS; permitted: tls/ or quic/ with certificates, an"
-            f" address of loopback, or by name, {PLACE}.insecure = true"
+            "other machines can reach this endpoint without TLS; use tls/ or quic/ with"
+            f" certificates or a loopback address, or accept it with {PLACE}.insecure = true"
         )
     if table.certificates is None:
         return (
-            "every user of this machine could pass for any rack here; permitted: unix/ and a name,"
-            f" certificates, which seal what is sent, or by name, {PLACE}.insecure = true"
+            "every user of this machine could impersonate another rack; use unix/ and a name or"
+            f" certificates, which protect messages, or accept it with {PLACE}.insecure = true"
         )
     return ""
 
 
-def credential_mistakes(config: RackConfig) -> Mistakes:
-    """Yield what is wrong with the files of the credentials on this machine, now."""
+def check_credentials(config: RackConfig) -> Mistakes:
+    """Check the certificate files of this machine at the present time."""
     table = config.adapter.lan
     if table is None or table.certificates is None:
         return
@@ -252,31 +264,29 @@ def credential_mistakes(config: RackConfig) -> Mistakes:
     heard = [end for end in endpoints_of(table) if str(end) in table.listen]
     addresses = dict.fromkeys(e.host for e in heard if e.has_tls and not e.is_everywhere)
     for flaw in Credentials(Path(table.certificates), config.name).flaws(addresses):
-        # The file first: a long path is cut short.
+        # The file name comes first, because long texts are cut off at the end.
         yield Mistake(
             f"{PLACE}.certificates", None, f"{flaw.path.name}: {flaw.why}; in {table.certificates}"
         )
 
 
-def network_notes(config: RackConfig) -> list[str]:
-    """Return what a launch says of the network: endpoints without TLS that others can reach,
-    certificates that end.
-    """
+def list_network_notes(config: RackConfig) -> list[str]:
+    """Return notes for the launch about open endpoints and certificates that expire soon."""
     table = config.adapter.lan
     if table is None:
         return []
-    far = _open(table)
-    may = "read and forge what is exchanged"
+    exposed = _open(table)
+    attack = "read and forge messages"
     if table.certificates is not None:
-        may = "read what is exchanged, and feign that racks come and go"
-    notes = [f"without TLS: whoever reaches {', '.join(far)} may {may}"] if far else []
+        attack = "read messages, and pretend that racks come and go"
+    notes = [f"no TLS: whoever reaches {', '.join(exposed)} can {attack}"] if exposed else []
     if table.certificates is not None and has_tls(table):
         from rack.boards.lan.credentials import Credentials
 
         expires = Credentials(Path(table.certificates), config.name).expires
         if expires - datetime.now(UTC) < SOON:
             notes.append(
-                f"certificates expire on {expires:%Y-%m-%d %H:%M} UTC: the other racks are lost"
-                " then"
+                f"certificates expire on {expires:%Y-%m-%d %H:%M} UTC; after that the other racks"
+                " are lost"
             )
     return notes

@@ -1,4 +1,4 @@
-"""What the levels' classes demand of their boards, and what arm and scene must be for them."""
+"""Rules for the parameters and programs of levels, for arm and scene, and for memory."""
 
 from __future__ import annotations
 
@@ -23,20 +23,18 @@ MAX_MODEL_BYTES = 2**30
 
 
 def params(wiring: Wiring) -> Mistakes:
-    """Check each board's parameters against the declarations of its executor's and planner's
-    classes.
-    """
+    """Check the parameters of each board against the declarations of its level's classes."""
     for table, kind in wiring.params:
         tables, _, board = table.partition(".")
-        given = getattr(wiring.config, tables)[board].params
+        values = getattr(wiring.config, tables)[board].params
         try:
-            kind.model_validate(given)
+            kind.model_validate(values)
         except ValidationError as error:
-            yield from mistakes_of(error, kind, given, f"{table}.params")
+            yield from mistakes_of(error, kind, values, f"{table}.params")
 
 
 def programs(wiring: Wiring) -> Mistakes:
-    """Check `[task]` against the programs declared by the levels' classes."""
+    """Check `[task]` against the program that each level's class declares."""
     config = wiring.config
     for kind in wiring.programs:
         try:
@@ -49,7 +47,12 @@ def programs(wiring: Wiring) -> Mistakes:
 
 
 def sizes(wiring: Wiring, sizes: Mapping[str, int]) -> Mistakes:
-    """Check that the rack knows each size that a message needs."""
+    """Check that the rack defines every size that the fields of a message need.
+
+    Args:
+        wiring: The wiring.
+        sizes: The defined sizes by name, such as the number of joints.
+    """
     for mailbox, (ports, output) in wiring.writers.items():
         try:
             output.message.message_type.dtype(sizes)
@@ -58,7 +61,7 @@ def sizes(wiring: Wiring, sizes: Mapping[str, int]) -> Mistakes:
 
 
 def memory(layout: Layout) -> Mistakes:
-    """Check the size of the segment, and name the largest mailbox."""
+    """Check that the segment is not too large. The mistake names the largest mailbox."""
     size = AddressMap(layout).size
     if size > MAX_SEGMENT_BYTES:
         box = max(layout.mailboxes, key=lambda mailbox: mailbox.depth * mailbox.size)
@@ -66,18 +69,22 @@ def memory(layout: Layout) -> Mistakes:
             f"{box.depth} messages are kept for its slowest reader, so the segment needs {size}"
             " bytes"
         )
-        advice = f"permitted: {MAX_SEGMENT_BYTES}; shorten cycles or within_cycles"
+        advice = f"at most {MAX_SEGMENT_BYTES} are possible; shorten cycles or within_cycles"
         yield Mistake(f"mailbox {box.name}", None, f"{why}; {advice}")
 
 
 def neighbours(wiring: Wiring, contexts: Mapping[str, LevelContext]) -> Mistakes:
-    """Ask each level whether its neighbours suit it; `contexts` by board, without boards that have
-    mistakes.
+    """Let each level check the boards above and below it.
+
+    Args:
+        wiring: The wiring.
+        contexts: Contexts of the levels, by board. Boards with mistakes have none, and neither
+            they nor their neighbours are checked.
     """
     for ports in wiring.tasks:
         board = wiring.config.board[ports.place.board]
-        asked = {ports.task, *board.above, *board.below}
-        if issubclass(ports.kind, Executor) and asked <= contexts.keys():
+        involved = {ports.task, *board.above, *board.below}
+        if issubclass(ports.kind, Executor) and involved <= contexts.keys():
             above, below = (
                 [contexts[other] for other in others] for others in (board.above, board.below)
             )
@@ -86,24 +93,24 @@ def neighbours(wiring: Wiring, contexts: Mapping[str, LevelContext]) -> Mistakes
 
 
 def scene(wiring: Wiring) -> Mistakes:
-    """Check the names of objects and obstacles."""
+    """Check that entries of the scene name existing bodies, and that names are unique."""
     scene = wiring.config.scene
-    for kind, key, those in (
+    for kind, key, bodies in (
         ("motion", "body", "obstacles"),
         ("push", "body", "objects"),
         ("goal", "object", "objects"),
     ):
         for at, entry in enumerate(getattr(scene, kind)):
             name = getattr(entry, key)
-            known = getattr(scene, those)
+            known = getattr(scene, bodies)
             if name not in known:
-                why = f"no such {those[:-1]}; scene.{those}: {', '.join(known) or 'none'}"
+                why = f"no such {bodies[:-1]}; scene.{bodies}: {', '.join(known) or 'none'}"
                 yield Mistake(f"scene.{kind}[{at}].{key}", name, why)
     yield from repeated("scene.objects and scene.obstacles", scene.bodies)
 
 
 def robot(wiring: Wiring) -> Mistakes:
-    """Check that the model is there, and that each list has a value per joint."""
+    """Check that the model file can be read and that each list has one value per joint."""
     robot = wiring.config.robot
     if robot is None:
         return
@@ -114,17 +121,18 @@ def robot(wiring: Wiring) -> Mistakes:
     for key, values, why in robot.misfits():
         yield Mistake(f"robot.{key}", values, why)
     if robot.hand is not None and robot.interface != "torque":
-        why = "tendons of a hand take tensions; permitted: torque"
+        why = 'tendons of a hand need tensions; must be "torque"'
         yield Mistake("robot.interface", robot.interface, why)
     yield from repeated("robot.joints", robot.joints)
 
 
 def cell(wiring: Wiring) -> Mistakes:
-    """Check that arm and scene fit the model. If a table of theirs has mistakes of its own, only
-    names are checked.
+    """Check that arm and scene fit the model.
+
+    If `[robot]` or `[scene]` has other mistakes, only names in the model are checked.
     """
     robot_table, scene_table = wiring.config.robot, wiring.config.scene
-    found: list[str] = []
+    reasons: list[str] = []
     if robot_table is None:
         return
     if not wiring.broken & {"robot", "scene"} and not [*robot(wiring), *scene(wiring)]:
@@ -132,15 +140,15 @@ def cell(wiring: Wiring) -> Mistakes:
             cell_sizes(wiring.config)
             return
         except RobotError as error:
-            found = [str(error)]
+            reasons = [str(error)]
     from rack.levels.robot.lookup import unknown_names
 
-    # Every name that the model lacks; none are known if the model cannot be read.
+    # List all names that the model lacks instead. If the model cannot be read, none are known.
     with suppress(RobotError):
-        found = [*unknown_names(robot_table, scene_table)] or found
-    for line in found:
-        place, colon, why = line.partition(": ")
+        reasons = [*unknown_names(robot_table, scene_table)] or reasons
+    for reason in reasons:
+        place, colon, why = reason.partition(": ")
         if colon and place.startswith(("robot", "scene")):
             yield Mistake(place, None, why)
         else:
-            yield Mistake("robot", None, line)
+            yield Mistake("robot", None, reason)

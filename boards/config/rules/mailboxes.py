@@ -1,4 +1,4 @@
-"""Mailboxes: who writes and reads them, on which side of the rack, and how they are shared."""
+"""Rules for mailboxes: their writers and readers, their side of the rack, and their protocols."""
 
 from __future__ import annotations
 
@@ -12,74 +12,73 @@ from rack.boards.exchange import EXCHANGE, exchange_message
 from rack.boards.host.adapter import Adapter
 
 PASS_IT = "pass it through a bus adapter: [board.<bridge>.params.pass]"
+"""Advice for a reader on the other side of the rack."""
 
 
 def ports(wiring: Wiring) -> Mistakes:
-    """Check that each class is there, and that its inputs are connected as it declares."""
+    """Check that the levels' classes exist and that their inputs are connected as declared."""
     for place, why in wiring.missing.items():
         yield Mistake(f"{place.table}.{place.class_key}", place.target, why)
     for place, ports in wiring.ports.items():
         table = place.table
         role = place.role
         inputs = ", ".join(ports.kind.inputs) or "none"
-        for output, told in ports.outputs.items():
-            if told.rests_on is not None and told.rests_on.name not in ports.inputs:
-                why = f"its output '{output}' rests on '{told.rests_on.name}'; inputs: {inputs}"
+        for port, output in ports.outputs.items():
+            if output.rests_on is not None and output.rests_on.name not in ports.inputs:
+                why = f"its output '{port}' rests on '{output.rests_on.name}'; inputs: {inputs}"
                 yield Mistake(f"{table}.{role}", place.target, why)
-        for port, given in wiring.config.rewired(place).items():
+        for port, sources in wiring.config.rewired(place).items():
             if port not in ports.kind.inputs:
                 why = f"the {role} has no such port; ports: {inputs}"
-                yield Mistake(f"{table}.{place.reads_key}.{port}", given, why)
+                yield Mistake(f"{table}.{place.reads_key}.{port}", sources, why)
         yield from ports.mistakes
 
 
 def writers(wiring: Wiring) -> Mistakes:
-    """Check that each mailbox has one writer."""
+    """Check that no mailbox has two writers."""
     for ports in wiring.ports.values():
         for mailbox in ports.writes.values():
             first = wiring.writers[mailbox][0]
             if first is not ports:
-                yield Mistake(f"mailbox {mailbox}", ports.task, f"already written by {first.task}")
+                yield Mistake(f"mailbox {mailbox}", ports.task, f"{first.task} already writes it")
 
 
 def reads(wiring: Wiring) -> Mistakes:
-    """Check that each mailbox that is read exists, and carries what the port needs."""
+    """Check that every mailbox that is read exists and carries the port's type of message."""
     for ports in wiring.ports.values():
         for port, mailbox in ports.sources:
             place = _wired_at(ports, port)
-            wanted = ports.inputs[port].message.message_type
+            needed = ports.inputs[port].message.message_type
             if not wiring.is_known(mailbox):
                 yield Mistake(place, mailbox, f"no task writes it; mailboxes: {wiring.names}")
             elif (
                 ports.is_whole
-                and (found := wiring.types.get(mailbox)) is not None
-                and found != wanted
+                and (carried := wiring.types.get(mailbox)) is not None
+                and carried != needed
             ):
                 why = (
-                    f"carries {found.name} {found.version}; the port needs {wanted.name}"
-                    f" {wanted.version}"
+                    f"carries {carried.name} {carried.version}; the port needs {needed.name}"
+                    f" {needed.version}"
                 )
                 yield Mistake(place, mailbox, why)
 
 
 def _wired_at(ports: TaskPorts, port: str) -> str:
-    """Return the key of a config under which an input is wired, as in
-    "board.servo.reads.command".
-    """
+    """Return the place in the config where an input is wired: "board.servo.reads.command"."""
     place = ports.place
     key = ports.kind.wired_by if issubclass(ports.kind, Adapter) else place.reads_key
     return f"{place.table}.{key}.{port}"
 
 
 def statuses(wiring: Wiring) -> Mistakes:
-    """Check that the board that ends the run has a status, and in it a state."""
+    """Check that the board that ends the run writes a status with a state."""
     for name, board in wiring.config.board.items():
         if not board.ends_run:
             continue
         if not wiring.is_known(f"{name}.status"):
             yield Mistake(f"board.{name}.ends_run", True, "its executor writes no status")
-        elif (found := wiring.types.get(f"{name}.status")) is not None and not any(
-            field.name == "state" and field.unit is State for field in found.fields
+        elif (status := wiring.types.get(f"{name}.status")) is not None and not any(
+            field.name == "state" and field.unit is State for field in status.fields
         ):
             yield Mistake(
                 f"board.{name}.ends_run", True, "its status has no field 'state' of State"
@@ -87,7 +86,7 @@ def statuses(wiring: Wiring) -> Mistakes:
 
 
 def sides(wiring: Wiring) -> Mistakes:
-    """Check that only bus adapters read mailboxes of the other side."""
+    """Check that only bus adapters read mailboxes of both the real-time and the host side."""
     for task in wiring.ports.values():
         for port, mailbox in task.sources:
             if mailbox.partition(".")[0] not in wiring.unknown and (
@@ -97,53 +96,55 @@ def sides(wiring: Wiring) -> Mistakes:
 
 
 def _reason(wiring: Wiring, task: TaskPorts, mailbox: str) -> str:
-    """Return why a task or host board must not read a mailbox; empty if it may."""
+    """Return why a task or host board must not read a mailbox. Empty if it may."""
     is_host = task.place.role == "host"
     is_of_host = mailbox in wiring.of_host
     if task.joins_sides:
-        return "it is on the host side already" if mailbox in wiring.to_host else ""
+        return "it is already on the host side" if mailbox in wiring.to_host else ""
     if is_host == is_of_host:
         return ""
     if (source := wiring.passed.get(mailbox)) is None:
         side = "host" if is_of_host else "real-time"
         return f"it is on the {side} side; {PASS_IT}"
     writer = source.partition(".")[0]
-    same = "host" if is_host else "real-time"
+    side = "host" if is_host else "real-time"
     return (
         f"a bus adapter joins the two sides; '{writer}' and '{task.place.board}' are both on the"
-        f" {same} side"
+        f" {side} side"
     )
 
 
 NOT_OPERATED = {
     "lock": "the clock writes it and must not wait",
-    "queue": "it keeps every command already",
+    "queue": "it already keeps every command",
     "interrupt": "the clock writes it, not a board",
 }
-"""Protocols that an operator's mailbox cannot have, and why."""
+"""Protocols that an operator's mailbox cannot have, with the reasons."""
 
 
 def strict(wiring: Wiring) -> Mistakes:
-    """Refuse everything that makes a run depend on timing, if the config says so."""
+    """If `protocol.strict` is set, report everything that makes a run depend on timing."""
     config = wiring.config
     if not config.protocol.strict:
         return
-    why = "makes a run depend on timing, refused by protocol.strict = true; permitted"
+    why = "makes a run depend on timing, which protocol.strict = true refuses; must be"
     if config.protocol.default not in BY_TICKS:
-        yield Mistake("protocol.default", config.protocol.default, f"{why}: time-slice, interrupt")
+        yield Mistake("protocol.default", config.protocol.default, f"{why} time-slice or interrupt")
     for mailbox, protocol in config.protocol.mailbox.items():
         if protocol not in BY_TICKS:
-            yield Mistake(f"protocol.mailbox.{mailbox}", protocol, f"{why}: {', '.join(BY_TICKS)}")
+            yield Mistake(
+                f"protocol.mailbox.{mailbox}", protocol, f"{why} one of {', '.join(BY_TICKS)}"
+            )
     for name in config.host:
-        yield Mistake(f"host.{name}", None, f"a board without real time {why}: boards with a rate")
+        yield Mistake(f"host.{name}", None, f"a board without real time {why} a board with a rate")
     for name, board in config.board.items():
         for port, entry in board.exchange.items():
             if entry.asynchronous:
-                yield Mistake(f"board.{name}.exchange.{port}.asynchronous", True, f"{why}: false")
+                yield Mistake(f"board.{name}.exchange.{port}.asynchronous", True, f"{why} false")
 
 
 def exchange(wiring: Wiring) -> Mistakes:
-    """Check when boards read their ports, and that a mailbox is free for what they record of it."""
+    """Check the times at which executors read their ports, and the mailbox that records them."""
     for ports in wiring.tasks:
         if not ports.exchange or not ports.is_whole:
             continue
@@ -159,36 +160,36 @@ def exchange(wiring: Wiring) -> Mistakes:
                 yield Mistake(
                     f"{place}.every",
                     entry.every,
-                    "an asynchronous port is read in every cycle; permitted: 1",
+                    "an asynchronous port is read in every cycle; must be 1",
                 )
             elif entry.phase >= entry.every:
-                why = f"must be less than every; permitted: 0 to {entry.every - 1} cycles"
+                why = f"must be less than every: 0 to {entry.every - 1} cycles"
                 yield Mistake(f"{place}.phase", entry.phase, why)
-        made = exchange_message(ports.reads).message_type
-        if ports.outputs[EXCHANGE].message.message_type != made:
-            why = "the executor writes a mailbox of that name itself; rename its output"
+        record_type = exchange_message(ports.reads).message_type
+        if ports.outputs[EXCHANGE].message.message_type != record_type:
+            why = "the executor itself writes a mailbox of this name; rename its output"
             yield Mistake(f"board.{ports.task}.exchange", None, why)
 
 
 def operated(wiring: Wiring) -> Mistakes:
-    """Check that only the clock writes operators' mailboxes, never waits, and never finds one
-    full.
-    """
+    """Check that only the clock writes operators' mailboxes, with a protocol that never waits."""
     for mailbox in wiring.operated:
         if mailbox in wiring.writers:
             first = wiring.writers[mailbox][0].task
             yield Mistake(
                 f"mailbox {mailbox}", first, "only the clock writes an operator's mailbox"
             )
-        given = wiring.config.protocol.mailbox.get(mailbox)
-        if why := NOT_OPERATED.get(given or ""):
+        protocol = wiring.config.protocol.mailbox.get(mailbox)
+        if why := NOT_OPERATED.get(protocol or ""):
             yield Mistake(
-                f"protocol.mailbox.{mailbox}", given, f"{why}; permitted: time-slice, double-buffer"
+                f"protocol.mailbox.{mailbox}",
+                protocol,
+                f"{why}; must be time-slice or double-buffer",
             )
 
 
 def mailboxes(wiring: Wiring) -> Mistakes:
-    """Check that the mailboxes exist whose protocol the config gives."""
+    """Check that every mailbox with a protocol in the config exists."""
     for mailbox in wiring.config.protocol.mailbox:
         if not wiring.is_known(mailbox):
             yield Mistake(
@@ -199,17 +200,16 @@ def mailboxes(wiring: Wiring) -> Mistakes:
 
 
 def queues(wiring: Wiring) -> Mistakes:
-    """Check which mailboxes are queues, their readers and their depths, if the two sides are
-    apart.
-    """
+    """Check which mailboxes are queues, how many readers they have, and their depths."""
+    # A task that reads from the wrong side is reported by `check_sides` alone.
     if any(sides(wiring)):
         return
     table = wiring.config.protocol
     for mailbox, (ports, output) in wiring.writers.items():
-        given = table.mailbox.get(mailbox, "queue")
-        if output.queued and given != "queue":
-            why = f"'{ports.task}' sends any number of messages in a cycle; permitted: queue"
-            yield Mistake(f"protocol.mailbox.{mailbox}", given, why)
+        protocol = table.mailbox.get(mailbox, "queue")
+        if output.queued and protocol != "queue":
+            why = f"'{ports.task}' sends any number of messages in a cycle; must be queue"
+            yield Mistake(f"protocol.mailbox.{mailbox}", protocol, why)
         elif wiring.protocol(mailbox) == "queue":
             yield from _queue(wiring, mailbox)
     for mailbox, depth in table.depth.items():
@@ -221,14 +221,12 @@ def queues(wiring: Wiring) -> Mistakes:
             )
         elif wiring.protocol(mailbox) != "queue":
             queues = [name for name in wiring.writers if wiring.protocol(name) == "queue"]
-            why = f"not a queue: it holds one message; queues: {', '.join(queues) or 'none'}"
+            why = f"it is not a queue and holds one message; queues: {', '.join(queues) or 'none'}"
             yield Mistake(f"protocol.depth.{mailbox}", depth, why)
 
 
 def _queue(wiring: Wiring, mailbox: str) -> Mistakes:
-    """Check one queue: exactly one port reads it, and its reader's position has a name of its
-    own.
-    """
+    """Check that exactly one port reads a queue, and that its reader's position has a free name."""
     if taken_name(mailbox) in wiring.writers:
         why = (
             f"the reader of the queue '{mailbox}' writes its position under this name; rename the"
@@ -244,7 +242,7 @@ def _queue(wiring: Wiring, mailbox: str) -> Mistakes:
     exports = [port for task, port in reading if task == LAN]
     if wiring.config.adapter.lan is not None and exports:
         why = (
-            "a queue gives each message once, to its one reader here; permitted: mailboxes that"
+            "a queue gives each message once, to its reader in this rack; export mailboxes that"
             " hold one message"
         )
         yield Mistake(f"adapter.lan.export.{exports[0]}.from", mailbox, why)
@@ -255,21 +253,20 @@ def _queue(wiring: Wiring, mailbox: str) -> Mistakes:
         )
         yield Mistake(f"mailbox {mailbox}", None, why)
     elif not readers and not wiring.unknown:
-        why = "no task reads this queue, so it would fill and stay full; permitted: one reader"
+        why = "no task reads this queue, so it would stay full; it needs one reader"
         yield Mistake(f"mailbox {mailbox}", None, why)
 
 
 def asynchronous(wiring: Wiring) -> Mistakes:
-    """Check that what a port reads asynchronously can be read at once."""
+    """Check that the messages of asynchronous ports can be read as soon as they are written."""
     for ports in wiring.tasks:
         for port, mailbox in ports.sources:
             why = {
                 "queue": (
-                    f"'{mailbox}' is a queue, and its messages are taken by ticks; permitted: false"
+                    f"'{mailbox}' is a queue, whose messages are taken at ticks; must be false"
                 ),
                 "interrupt": (
-                    f"the messages of '{mailbox}' interrupt the board as they come already;"
-                    " permitted: false"
+                    f"the messages of '{mailbox}' already interrupt the board; must be false"
                 ),
             }.get(wiring.protocol(mailbox))
             if port in ports.exchange and ports.exchange[port].asynchronous and why is not None:
@@ -277,14 +274,14 @@ def asynchronous(wiring: Wiring) -> Mistakes:
 
 
 def interrupts(wiring: Wiring) -> Mistakes:
-    """Check that messages of which the config demands it can interrupt."""
-    for mailbox, given in wiring.config.protocol.mailbox.items():
-        if given != "interrupt":
+    """Check that the messages of mailboxes with protocol interrupt can interrupt a board."""
+    for mailbox, protocol in wiring.config.protocol.mailbox.items():
+        if protocol != "interrupt":
             continue
         place = f"protocol.mailbox.{mailbox}"
         if mailbox in wiring.of_host:
-            why = "it is on the host side, where nothing is interrupted; permitted: no entry"
-            yield Mistake(place, given, why)
+            why = "it is on the host side, where nothing is interrupted; remove this entry"
+            yield Mistake(place, protocol, why)
         elif wiring.is_of_network(mailbox):
-            why = "the network adapter writes it as messages come in"
-            yield Mistake(place, given, f"{why}; permitted: time-slice, double-buffer")
+            why = "the network adapter writes it; must be time-slice or double-buffer"
+            yield Mistake(place, protocol, why)

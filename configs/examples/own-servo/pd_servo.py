@@ -13,7 +13,7 @@ class Gains(LawParams):
     stiffness: Positive = 1600.0
     """acceleration for an error of one rad, 1/s2"""
     damping: Positive = 80.0
-    """acceleration against an error of one rad/s, 1/s"""
+    """acceleration against an error of one rad/s [1/s]"""
 
 
 class PdServo(ServoLaw):

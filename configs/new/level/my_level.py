@@ -14,7 +14,7 @@ class MyLevelParams(Table):
     """What `[board.my_level.params]` may hold."""
 
     limit: Live[Positive] = 2.0
-    """speed of a joint from which it is reported, rad/s"""
+    """speed of a joint from which it is reported [rad/s]"""
 
 
 class MyLevelStatus(AnsweringStatus, version=1):

@@ -16,7 +16,7 @@ class MyServoParams(LawParams):
     stiffness: Live[Positive] = 2500.0
     """acceleration for an error of one rad, 1/s2"""
     damping: Live[Positive] = 100.0
-    """acceleration against an error of one rad/s, 1/s"""
+    """acceleration against an error of one rad/s [1/s]"""
 
 
 class MyServo(ServoLaw):

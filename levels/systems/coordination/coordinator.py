@@ -141,9 +141,9 @@ class CoordinatorParams(Table):
     """mailbox with an arm's report, by the arm's name; its orders are in order_<name>"""
     stalled_s: Positive = 180.0
     """time without any progress after which the program ends, unless an operator holds it; longer
-    than an arm's, s"""
+    than an arm's [s]"""
     farewell_s: Positive = 10.0
-    """time that the arms have to come to rest and to confirm the end of the program, s"""
+    """time that the arms have to come to rest and to confirm the end of the program [s]"""
 
 
 class Coordinator(Executor):

@@ -47,7 +47,7 @@ class OrderedTaskParams(TaskParams):
     orders: MailboxName = "lan.orders"
     """mailbox with the orders"""
     decision: Positive = 5.0
-    """time between an answer and the order to do it, for which a promised time holds, s"""
+    """time between an answer and the order to do it, for which a promised time holds [s]"""
 
 
 class OrderedTaskExecutor(TaskExecutor):

@@ -76,11 +76,11 @@ class ContactConfig(Table):
     frame: str
     """task frame"""
     wrench: dict[Axis, Finite] = {}
-    """wrench of the tool on the surroundings on axes of force, N or N m; by axis"""
+    """wrench of the tool on the surroundings on axes of force [N or N m]; by axis"""
     speed: dict[Axis, Positive] = {}
-    """largest velocity on axes of force, m/s or rad/s; by axis; default: the server's"""
+    """largest velocity on axes of force [m/s or rad/s]; by axis; default: the server's"""
     guard: dict[Axis, Positive] = {}
-    """wrench, in either direction, that ends a motion, N or N m; by axis"""
+    """wrench, in either direction, that ends a motion [N or N m]; by axis"""
 
 
 class ForceProgram(Program):

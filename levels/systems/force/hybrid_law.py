@@ -50,13 +50,13 @@ class HybridGains(Table):
     """
 
     stiffness: Positive = 10_000.0
-    """stiffness of the stiffest contact, tool included, N/m"""
+    """stiffness of the stiffest contact, tool included [N/m]"""
     turning_stiffness: Positive = 40.0
-    """stiffness of the stiffest contact about an axis, N m/rad"""
+    """stiffness of the stiffest contact about an axis [N m/rad]"""
     bandwidth: Positive = Field(10.0, le=100.0)
-    """bandwidth of the force loop in that contact, rad/s"""
+    """bandwidth of the force loop in that contact [rad/s]"""
     smoothing: Positive = Field(0.03, le=1.0)
-    """time constant of the velocity on axes of force, s"""
+    """time constant of the velocity on axes of force [s]"""
 
 
 class ForceTask(NamedTuple):

@@ -46,19 +46,19 @@ class ServerParams(TrajectoryParams):
     """`[board.<name>.params]`: how contacts are judged, and the reaction to a lost client."""
 
     speed: Positive = 0.05
-    """largest velocity on an axis of force if a request gives none, m/s"""
+    """largest velocity on an axis of force if a request gives none [m/s]"""
     turning: Positive = 0.2
-    """largest velocity about an axis of force if a request gives none, rad/s"""
+    """largest velocity about an axis of force if a request gives none [rad/s]"""
     tolerance: Positive = Field(0.3, le=1.0)
     """permitted error of a force, as a part of the wanted one"""
     settle: Positive = 0.2
-    """time within the tolerance after which forces are settled and a COMPLY is done, s"""
+    """time within the tolerance after which forces are settled and a COMPLY is done [s]"""
     reach: Positive = 4.0
-    """time without settled forces after which compliance ends, s"""
+    """time without settled forces after which compliance ends [s]"""
     silence: Positive = 2.0
-    """time without a sign of life after which the client is lost, s"""
+    """time without a sign of life after which the client is lost [s]"""
     hold: Positive = 3.0
-    """time for which forces are held without a client, s"""
+    """time for which forces are held without a client [s]"""
 
 
 class ServerWork(RequestWork):

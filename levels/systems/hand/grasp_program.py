@@ -24,9 +24,9 @@ class PreshapeStep(Table):
     do: Literal["preshape"] = "preshape"
     """the kind of step"""
     posture: str
-    """name of the posture, in [task.posture]"""
+    """name of the posture, in `[task.posture]`"""
     seconds: Positive = 1.0
-    """duration, s"""
+    """duration [s]"""
 
 
 class CloseStep(Table):
@@ -41,15 +41,15 @@ class CloseStep(Table):
     object: str
     """object of the scene"""
     points: Mapping[str, Vector] = {}
-    """target points of the tips inside the object, in its frame, m, by finger"""
+    """target points of the tips inside the object, in its frame [m], by finger"""
     depth: Positive = Field(0.01, le=0.2)
-    """depth of a target point below a planned contact, m"""
+    """depth of a target point below a planned contact [m]"""
     speed: Positive = Field(0.03, le=1.0)
-    """speed of the tip with the longest way, m/s"""
+    """speed of the tip with the longest way [m/s]"""
     touch: Positive = 0.3
-    """force at which a tip touches the object, N"""
+    """force at which a tip touches the object [N]"""
     seconds: Positive = 3.0
-    """time within which all tips must touch the object, s"""
+    """time within which all tips must touch the object [s]"""
 
 
 class SqueezeStep(Table):
@@ -58,9 +58,9 @@ class SqueezeStep(Table):
     do: Literal["squeeze"] = "squeeze"
     """the kind of step"""
     grip: Positive
-    """force of the opposing finger, shared by the others, N"""
+    """force of the opposing finger, shared by the others [N]"""
     seconds: Positive = 0.5
-    """duration of the rise, s"""
+    """duration of the rise [s]"""
 
 
 class ShiftStep(Table):
@@ -69,9 +69,9 @@ class ShiftStep(Table):
     do: Literal["shift"] = "shift"
     """the kind of step"""
     by: Vector
-    """displacement of the object in the world's frame, m"""
+    """displacement of the object in the world's frame [m]"""
     seconds: Positive = 1.0
-    """duration, s"""
+    """duration [s]"""
 
 
 class HoldStep(Table):
@@ -80,7 +80,7 @@ class HoldStep(Table):
     do: Literal["hold"] = "hold"
     """the kind of step"""
     seconds: Positive
-    """duration, s"""
+    """duration [s]"""
 
 
 class ReleaseStep(Table):
@@ -89,9 +89,9 @@ class ReleaseStep(Table):
     do: Literal["release"] = "release"
     """the kind of step"""
     way: Positive = Field(0.015, le=0.2)
-    """distance by which the tips withdraw, m"""
+    """distance by which the tips withdraw [m]"""
     seconds: Positive = 1.0
-    """duration, s, half of it for the forces"""
+    """duration [s], half of it for the forces"""
 
 
 Step = PreshapeStep | CloseStep | SqueezeStep | ShiftStep | HoldStep | ReleaseStep
@@ -105,7 +105,7 @@ class GraspProgram(Program):
     opposing: str = "thumb"
     """name of the finger that opposes all others"""
     posture: Mapping[str, Posture] = {}
-    """joint positions of every finger, rad, by posture"""
+    """joint positions of every finger [rad], by posture"""
     step: tuple[Annotated[Step, Field(discriminator="do")], ...] = Field((), max_length=MAX_STEPS)
     """steps, executed in order"""
 

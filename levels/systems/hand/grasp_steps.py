@@ -84,15 +84,15 @@ class GraspParams(GripGains):
     """`[board.<name>.params]` of a grasp loop."""
 
     astray: Positive = 0.03
-    """largest position error of a joint in a posture, rad"""
+    """largest position error of a joint in a posture [rad]"""
     patience: Positive = 1.0
-    """time beyond its duration after which a step has failed, s"""
+    """time beyond its duration after which a step has failed [s]"""
     stalled: Positive = 60.0
-    """duration of a suspension, except holds of an operator, that fails the program, s"""
+    """duration of a suspension, except holds of an operator, that fails the program [s]"""
     lost: Positive = 0.2
-    """time without contact after which a finger has lost the object, s"""
+    """time without contact after which a finger has lost the object [s]"""
     tolerance: Positive = 0.02
-    """distance from its anchor at which a gripped object is lost, m"""
+    """distance from its anchor at which a gripped object is lost [m]"""
 
 
 @dataclass

@@ -30,17 +30,17 @@ class GripGains(Table):
     """Gains and limits of the grip."""
 
     stiffness: Positive = Field(300.0, le=5000.0)
-    """stiffness of each tip about its point, N/m; the opposing tip has the sum of the others"""
+    """stiffness of each tip about its point [N/m]; the opposing tip has the sum of the others"""
     recover: NotNegative = 4000.0
-    """integral gain of the force on a displaced object, N/(m s)"""
+    """integral gain of the force on a displaced object [N/(m s)]"""
     creep: NotNegative = Field(0.5, le=5.0)
-    """rate at which points follow tips that have crept, 1/s"""
+    """rate at which points follow tips that have crept [1/s]"""
     most_load: NotNegative = 8.0
-    """largest force of the integral, N"""
+    """largest force of the integral [N]"""
     reserve: NotNegative = Field(0.5, le=5.0)
     """increase of the grip force with the sensed load, N/N"""
     most_grip: Positive = 14.0
-    """largest force of the opposing finger, N"""
+    """largest force of the opposing finger [N]"""
 
 
 class HandGrip:

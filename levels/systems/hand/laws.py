@@ -175,11 +175,11 @@ class JointGains(Table):
     """Gains of the joint loop."""
 
     bandwidth: Positive = Field(35.0, le=400.0)
-    """natural frequency of the error in every joint, rad/s"""
+    """natural frequency of the error in every joint [rad/s]"""
     damping: Positive = Field(0.7, le=5.0)
     """damping ratio of the loop, in addition to the friction of joints"""
     ahead: NotNegative = Field(0.006, le=0.1)
-    """time from a command until the tensions have followed it, s"""
+    """time from a command until the tensions have followed it [s]"""
 
 
 class JointLaw:
@@ -292,15 +292,15 @@ class TendonGains(Table):
     """Model of the valves, and gains of the tendon law."""
 
     lag: Positive = Field(0.008, le=1.0)
-    """time constant of a valve, s"""
+    """time constant of a valve [s]"""
     lead: NotNegative = Field(1.0, le=4.0)
     """excess command, as a fraction of the tension that has not arrived"""
     trim: NotNegative = Field(4.0, le=20.0)
-    """rate of correction of a valve's lasting error, 1/s"""
+    """rate of correction of a valve's lasting error [1/s]"""
     most_trim: NotNegative = 10.0
-    """largest correction, N"""
+    """largest correction [N]"""
     margin: NotNegative = 1.0
-    """margin above the hand's least tension for errors of a valve, N"""
+    """margin above the hand's least tension for errors of a valve [N]"""
 
 
 class TendonLaw:

@@ -49,11 +49,11 @@ class GraspRules(Table):
     """Requirements on a planned grasp."""
 
     pad: Positive = 0.009
-    """distance between the site of a tip and the surface that it touches, m"""
+    """distance between the site of a tip and the surface that it touches [m]"""
     clear: Positive = 0.02
-    """distance from the object at which tips begin to close, m"""
+    """distance from the object at which tips begin to close [m]"""
     pull: NotNegative = 2.0
-    """pull on the object that friction must bear in addition to its weight, N"""
+    """pull on the object that friction must bear in addition to its weight [N]"""
     reserve: Positive = Field(1.5, ge=1.0)
     """safety factor of friction"""
 
@@ -236,7 +236,7 @@ class WorkstationParams(Table):
     rules: GraspRules = GraspRules()
     """requirements on the grasp"""
     every_s: Positive = 0.2
-    """longest time between two checks of the object's position, s"""
+    """longest time between two checks of the object's position [s]"""
 
 
 class Workstation(HostProgram):

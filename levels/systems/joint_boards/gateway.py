@@ -30,7 +30,7 @@ class GatewayParams(Table):
     """`[board.<name>.params]`: the link to the level above, and missing references."""
 
     delay: NotNegative = Field(0.0, le=1.0)
-    """delay of the link in each direction, s"""
+    """delay of the link in each direction [s]"""
     missing: int = Field(5, ge=0, le=1000)
     """consecutive references that may be missing and are extrapolated"""
 
@@ -165,9 +165,9 @@ class NetworkGatewayParams(GatewayParams):
     """`[board.<name>.params]`: the link, and the rack at its other end."""
 
     period: Positive = Field(0.02, le=1.0)
-    """time from reference to reference, s"""
+    """time from reference to reference [s]"""
     tick: Positive = Field(0.001, le=1.0)
-    """length of a tick of the rack that sends references, s"""
+    """length of a tick of the rack that sends references [s]"""
 
 
 class NetworkGateway(JointGateway):

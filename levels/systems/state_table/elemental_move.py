@@ -53,7 +53,7 @@ class TaughtPoseConfig(Table):
     """`[plan.pose.<name>]`: pose of the tool, pointing down, relative to an object or a place."""
 
     height: Finite
-    """height of the tool above the origin of the object or place, m"""
+    """height of the tool above the origin of the object or place [m]"""
     speed: Positive = Key(1.0, le=1.0)
     """fraction of the joints' limits on the way to the pose"""
 
@@ -64,9 +64,9 @@ class MovePlanConfig(Table):
     pose: dict[Name, TaughtPoseConfig] = Key(min_length=1)
     """poses by name"""
     place: dict[Name, Place] = {}
-    """origin of an object after it was put at the place, m, by name"""
+    """origin of an object after it was put at the place [m], by name"""
     moved: NotNegative = 0.01
-    """distance from its sensed or intended position beyond which an object is displaced, m"""
+    """distance from its sensed or intended position beyond which an object is displaced [m]"""
     home_speed: Positive = Key(1.0, le=1.0)
     """fraction of the joints' limits on the way home"""
 

@@ -76,7 +76,7 @@ class PrimitivePlanConfig(Table):
     """`[plan]` of the primitive level's table."""
 
     settled: Positive = 0.01
-    """distance from its end position within which a joint has arrived, rad"""
+    """distance from its end position within which a joint has arrived [rad]"""
 
 
 class PrimitiveTable(StateTableExecutor):

@@ -181,7 +181,7 @@ class TableConfig(Table):
     start: Name
     """initial state"""
     patience: Positive = 10.0
-    """time in one state after which the condition late is yes, s"""
+    """time in one state after which the condition late is yes [s]"""
     row: tuple[dict[str, Any], ...] = Field(min_length=1, max_length=500)
     """its rows"""
     plan: dict[str, Any] = {}

@@ -50,9 +50,9 @@ class MotionStep(Table):
     """Base of the steps that move the arm."""
 
     segment: NotNegative = 0.0
-    """time of the segment, s; 0 chooses it from the limits, and too short a time is stretched"""
+    """time of the segment [s]; 0 chooses it from the limits, and too short a time is stretched"""
     acceleration: NotNegative = 0.0
-    """half the time of the blend into the segment, s; 0 for the level's default"""
+    """half the time of the blend into the segment [s]; 0 for the level's default"""
 
 
 class HomeStep(MotionStep):
@@ -68,9 +68,9 @@ class MoveStep(MotionStep):
     do: Literal["move"] = "move"
     """the kind of step"""
     joints: tuple[Finite, ...] | None = None
-    """joint positions, rad"""
+    """joint positions [rad]"""
     position: Vector | None = None
-    """position of the tool, m"""
+    """position of the tool [m]"""
     quaternion: Turn | None = None
     """orientation of the tool, as w, x, y, z; by default as at home"""
 
@@ -92,7 +92,7 @@ class LineStep(MotionStep):
     do: Literal["line"] = "line"
     """the kind of step"""
     position: Vector
-    """position of the tool, m, in the frame of `body`"""
+    """position of the tool [m], in the frame of `body`"""
     quaternion: Turn | None = None
     """orientation of the tool in the same frame, as w, x, y, z; by default as at home"""
     body: str | None = None
@@ -115,7 +115,7 @@ class StayStep(Table):
     do: Literal["stay"] = "stay"
     """the kind of step"""
     seconds: Positive
-    """duration, s"""
+    """duration [s]"""
 
 
 class GripStep(Table):
@@ -124,11 +124,11 @@ class GripStep(Table):
     do: Literal["grip"] = "grip"
     """the kind of step"""
     opening: Finite
-    """gripper joint position, m or rad"""
+    """gripper joint position [m or rad]"""
     force: Positive | None = None
-    """largest force, N or N m; by default the gripper's force"""
+    """largest force [N or N m]; by default the gripper's force"""
     seconds: NotNegative = 0.0
-    """time for the motion, s; 0 for the level's default"""
+    """time for the motion [s]; 0 for the level's default"""
 
 
 class CancelStep(Table):
@@ -137,7 +137,7 @@ class CancelStep(Table):
     do: Literal["cancel"] = "cancel"
     """the kind of step"""
     after: NotNegative
-    """time since the previous step began, s"""
+    """time since the previous step began [s]"""
 
 
 Step = MoveStep | LineStep | HomeStep | StayStep | GripStep | CancelStep

@@ -30,13 +30,13 @@ class TrajectoryParams(Table):
     """Times of motions and of following, in `[board.<name>.params]`."""
 
     acceleration: Positive = 0.3
-    """half the time of a blend if a request gives none, s"""
+    """half the time of a blend if a request gives none [s]"""
     gripping: Positive = 0.6
-    """time of a GRIP if a request gives none, s"""
+    """time of a GRIP if a request gives none [s]"""
     follow: Positive = 0.25
-    """time constant with which a live goal follows its body, s"""
+    """time constant with which a live goal follows its body [s]"""
     blind: Positive = 0.3
-    """longest time for which the motion of a body is extrapolated, s"""
+    """longest time for which the motion of a body is extrapolated [s]"""
     handover: int = Field(HANDOVER_CYCLES, ge=1, le=1000)
     """cycles after the first set point until statuses must show that it is followed"""
 

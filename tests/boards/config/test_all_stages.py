@@ -73,7 +73,7 @@ def test_mistakes_of_all_stages_come_at_once(small: Path, write: Write) -> None:
     assert found == sorted([*parts, "--set", "--faults", "supervision.restarts"])
 
 
-def test_a_setting_with_a_mistake_leaves_nothing_missing(small: Path, write: Write) -> None:
+def test_an_invalid_setting_does_not_report_missing_keys(small: Path, write: Write) -> None:
     alone = write("alone.toml", '[board.lower]\nslot = 2\nexecutor = "nowhere:Nothing"\n')
     with pytest.raises(ConfigError) as error:
         load(alone, ["name=alone", "clock.period_ms", "board.lower.every"])

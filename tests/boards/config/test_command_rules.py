@@ -41,7 +41,7 @@ def mistakes(config: RackConfig, broken: frozenset[str] = frozenset(), **given: 
         {"level": "servo", "what": "setpoint", "joints": HOME},
     ],
 )
-def test_what_is_permitted_has_no_mistakes(nasrem: RackConfig, given: dict[str, Any]) -> None:
+def test_a_valid_command_has_no_mistakes(nasrem: RackConfig, given: dict[str, Any]) -> None:
     assert mistakes(nasrem, **given) == []
 
 
@@ -64,7 +64,7 @@ MISTAKES: list[tuple[dict[str, Any], str]] = [
     ),
     (
         {"level": "servo", "what": "setpoint", **PLACE},
-        "position: not a goal for setpoint of 'servo'; permitted: joints",
+        "position: not a goal for setpoint of 'servo'; valid goals: joints",
     ),
     (
         {"level": "task", "what": "goto", "quaternion": [1.0, 0.0, 0.0, 0.0]},
@@ -78,7 +78,7 @@ MISTAKES: list[tuple[dict[str, Any], str]] = [
             "direction": [0.0, 0.0, 1.0],
             "quaternion": [1.0, 0.0, 0.0, 0.0],
         },
-        "direction = [0.0, 0.0, 1.0]: quaternion is also given; permitted: one of quaternion,"
+        "direction = [0.0, 0.0, 1.0]: quaternion is also given; give only one of quaternion,"
         " direction",
     ),
     (
@@ -91,15 +91,15 @@ MISTAKES: list[tuple[dict[str, Any], str]] = [
     ),
     (
         {"level": "servo", "what": "setpoint", "joints": HOME[:5]},
-        f"joints = {HOME[:5]}: 5 values; permitted: 6, one per joint: j1, j2, j3, j4, j5, j6",
+        f"joints = {HOME[:5]}: 5 values; must be 6, one per joint: j1, j2, j3, j4, j5, j6",
     ),
     (
         {"level": "servo", "what": "setpoint", "joints": [9.0, *HOME[1:]]},
-        "joints = 9.0: out of range for joint 'j1'; permitted: -2.78753 to 2.78753 rad",
+        "joints = 9.0: out of range; joint 'j1' must be -2.78753 to 2.78753 rad",
     ),
     (
         {"level": "task", "what": "hold", "tick": 4, "at": 1.0},
-        "at = 1.0: tick is also given; permitted: one of tick, at",
+        "at = 1.0: tick is also given; give only one of tick, at",
     ),
     (
         {"level": "task", "what": "hold", "name": "x"},
@@ -117,7 +117,7 @@ def test_a_mistake_is_one_line(nasrem: RackConfig, given: dict[str, Any], line: 
     assert mistakes(nasrem, **given) == [line]
 
 
-def test_the_ends_of_a_joints_range_are_permitted(nasrem: RackConfig) -> None:
+def test_the_limits_of_a_joints_range_are_valid(nasrem: RackConfig) -> None:
     robot = nasrem.robot
     assert robot is not None
     ends = built_cell(nasrem).limits.position.T.tolist()
@@ -125,18 +125,18 @@ def test_the_ends_of_a_joints_range_are_permitted(nasrem: RackConfig) -> None:
         assert mistakes(nasrem, level="servo", what="setpoint", joints=joints) == []
 
 
-def test_no_more_commands_than_the_table_holds_can_wait(nasrem: RackConfig) -> None:
+def test_more_commands_than_the_table_has_entries_are_refused(nasrem: RackConfig) -> None:
     hold = ("", asked({"level": "task", "what": "hold"}))
     levels = publish(nasrem).levels
     assert command_mistakes([hold] * OPERATOR_ENTRIES, nasrem, levels) == []
     (found,) = command_mistakes([hold] * (OPERATOR_ENTRIES + 1), nasrem, levels)
     many = OPERATOR_ENTRIES + 1
     assert str(found) == (
-        f"command = {many}: too many pending commands; permitted: {OPERATOR_ENTRIES}"
+        f"command = {many}: too many commands; at most {OPERATOR_ENTRIES} may be pending"
     )
 
 
-def test_a_modification_is_put_in_or_taken_out_by_its_name(gentle: RackConfig) -> None:
+def test_a_modification_is_added_or_removed_by_name(gentle: RackConfig) -> None:
     def of(**given: Any) -> list[str]:
         return mistakes(gentle, level="servo", what="modify", **given)
 
@@ -150,7 +150,7 @@ def test_a_modification_is_put_in_or_taken_out_by_its_name(gentle: RackConfig) -
     assert "name" in unnamed
 
 
-def test_of_a_broken_board_only_its_own_mistakes_are_said(nasrem: RackConfig) -> None:
+def test_commands_to_a_broken_board_are_not_checked(nasrem: RackConfig) -> None:
     broken = frozenset({"task"})
     assert mistakes(nasrem, broken, level="task", what="goto") == []
     assert len(mistakes(nasrem, broken, level="servo", what="goto")) == 1

@@ -31,7 +31,7 @@ def message_of(config: RackConfig, **given: object) -> tuple[Message, int]:
     return message, made.tick
 
 
-def test_a_goal_of_joints_has_them_all(nasrem: RackConfig) -> None:
+def test_a_joint_goal_has_a_position_for_every_joint(nasrem: RackConfig) -> None:
     message, tick = message_of(nasrem, level="servo", what="setpoint", joints=HOME, tick=40)
     assert (message.what, message.goal, message.count, tick) == (
         Operation.SETPOINT,
@@ -44,7 +44,7 @@ def test_a_goal_of_joints_has_them_all(nasrem: RackConfig) -> None:
     assert not message.position.any()
 
 
-def test_a_goal_of_a_place_points_down_unless_it_is_said(nasrem: RackConfig) -> None:
+def test_a_position_goal_points_down_by_default(nasrem: RackConfig) -> None:
     given = {"level": "task", "what": "goto", "position": [0.4, 0.1, 0.3]}
     message, tick = message_of(nasrem, **given, at=1.0)
     assert (message.goal, message.count, tick) == (Goal.DIRECTION, 0, 400)
@@ -54,7 +54,7 @@ def test_a_goal_of_a_place_points_down_unless_it_is_said(nasrem: RackConfig) -> 
     assert message.direction.tolist() == [1.0, 0.0, 0.0]
 
 
-def test_a_quaternion_becomes_a_unit_one(nasrem: RackConfig) -> None:
+def test_a_quaternion_is_normalised(nasrem: RackConfig) -> None:
     message, _ = message_of(
         nasrem,
         level="task",
@@ -66,7 +66,7 @@ def test_a_quaternion_becomes_a_unit_one(nasrem: RackConfig) -> None:
     assert message.quaternion.tolist() == pytest.approx([0.0, 0.6, 0.0, 0.8])
 
 
-def test_what_a_level_takes_has_the_names_that_it_knows(nasrem: RackConfig) -> None:
+def test_the_commands_of_a_level_are_listed_with_their_valid_names(nasrem: RackConfig) -> None:
     assert takes(publish(nasrem).levels["primitive"]) == "hold, resume"
     config = load("configs/examples/own-modification/gentle.toml")
     servo = publish(config).levels["servo"]

@@ -33,7 +33,7 @@ MISTAKES: Mapping[str, tuple[Fault, str]] = {
     ),
     "two beginnings": (
         {"kind": "kill", "board": "wave", "tick": 1, "at": 1.0},
-        ".at = 1.0: tick is also given; permitted: one of tick, at, when",
+        ".at = 1.0: tick is also given; give only one of tick, at, when",
     ),
     "no time": (
         {"kind": "mute", "board": "wave", "for": "1 hour"},
@@ -57,7 +57,7 @@ MISTAKES: Mapping[str, tuple[Fault, str]] = {
     ),
     "clock kind": (
         {"kind": "clock-skip", "board": "wave"},
-        'clock-skip strikes only the clock; permitted: "clock"',
+        'clock-skip strikes only the clock; must be "clock"',
     ),
     "no kind of the clock": (
         {"kind": "mute", "board": "clock"},
@@ -165,7 +165,7 @@ def test_a_key_that_a_kind_cannot_have_is_one_mistake(kind: Kind) -> None:
             assert said.startswith(why.format(kind.name))
 
 
-def test_a_parameter_that_a_kind_lacks_lists_those_it_has() -> None:
+def test_an_unknown_parameter_of_a_fault_is_reported_with_the_known_ones() -> None:
     names = ", ".join(parameter.name for parameter in KINDS["drop"].parameters)
     assert mistake_of(KINDS["drop"], strength=2).endswith(f"parameters: {names}")
 
@@ -180,7 +180,7 @@ def test_a_parameter_out_of_range_is_reported_with_its_range(
         assert f"{parameter.least:g} to {parameter.most:g}; {parameter}" in line
     if parameter.is_whole:
         line = mistake_of(kind, **{parameter.name: parameter.least + 0.5})
-        assert "permitted: whole numbers" in line
+        assert "valid: whole numbers" in line
 
 
 @pytest.mark.parametrize("kind", [k for k in KINDS if k.realtime], ids=lambda kind: kind.name)
@@ -210,11 +210,11 @@ def test_a_lock_is_held_only_where_the_mailbox_has_one(config: MakeConfig) -> No
     wire(rack(config, fault, settings=(LOCKED,)))
 
 
-def test_a_joint_that_the_arm_lacks_is_refused() -> None:
+def test_a_joint_that_the_arm_does_not_have_is_refused() -> None:
     settings = ['fault=[{ kind = "sensor-nan", board = "servo", joint = 6 }]']
     with pytest.raises(
         ConfigError,
-        match="joint = 6: out of range; permitted: whole numbers -1 to 5; joint, counted from 0",
+        match="joint = 6: out of range; valid: whole numbers -1 to 5; joint, counted from 0",
     ):
         wire(load("nasrem", settings))
 
@@ -223,7 +223,7 @@ def test_more_faults_than_a_run_can_have_are_refused(config: MakeConfig) -> None
     faults = [{"kind": "kill", "board": "wave", "tick": tick} for tick in range(FAULT_ENTRIES + 1)]
     assert (
         only_mistake(config, *faults)
-        == f"fault = {len(faults)}: too many faults for one run; permitted: {FAULT_ENTRIES}"
+        == f"fault = {len(faults)}: too many faults; a run can have at most {FAULT_ENTRIES}"
     )
 
 

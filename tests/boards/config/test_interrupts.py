@@ -62,14 +62,11 @@ def test_a_message_costs_its_words_and_interrupts_other_boards_only(small: Path)
     [
         (
             "board.hub.exchange.below.asynchronous=true",
-            (
-                "the messages of 'figure0.status' interrupt the board as they come already;"
-                " permitted: false"
-            ),
+            ("the messages of 'figure0.status' already interrupt the board; must be false"),
         ),
     ],
 )
-def test_what_does_not_fit_is_refused(setting: str, why: str) -> None:
+def test_an_asynchronous_port_with_interrupts_is_refused(setting: str, why: str) -> None:
     with pytest.raises(ConfigError) as error:
         resolve(validated(Assembled(override(parse(RACK), [setting], []))))
     assert why in str(error.value)

@@ -36,7 +36,7 @@ def test_a_message_is_delayed_by_its_writers_slice(small: Path) -> None:
     }
 
 
-def test_mailboxes_keep_two_seconds_and_at_least_their_readers_slice(small: Path) -> None:
+def test_mailboxes_retain_two_seconds_and_at_least_their_readers_slice(small: Path) -> None:
     layout = wire(load(small, ["board.lower.within_cycles=9000"]))
     assert layout.mailbox("lower.status").depth == depth_for(800, 1)
     assert layout.mailbox("upper.command").depth == depth_for(9008, 8)
@@ -86,7 +86,7 @@ POLLING = (
 )
 
 
-def test_a_board_may_wait_otherwise_than_the_rack_and_a_planner_does_not_poll(small: Path) -> None:
+def test_a_board_may_override_the_racks_wake_and_a_planner_never_polls(small: Path) -> None:
     found = resolve(load(small, ["clock.wake=signal", *POLLING]))
     assert {task.name: task.wake for task in found.layout.tasks} == {
         "upper": "signal",
@@ -95,7 +95,7 @@ def test_a_board_may_wait_otherwise_than_the_rack_and_a_planner_does_not_poll(sm
     }
 
 
-def test_a_queue_keeps_what_may_be_unread_and_what_a_recorder_may_be_behind() -> None:
+def test_a_queue_has_room_for_unread_messages_and_a_late_recorder() -> None:
     layout = wire(load("penn"))
     sizes = {box.name: (box.capacity, box.depth) for box in layout.mailboxes}
     # Of a host board: its capacity, what may be under way, and what a writer needs; a power of two.

@@ -35,7 +35,9 @@ def test_a_mistake_is_one_line(small: Path, table: str, line: str) -> None:
     assert said.startswith(line)
 
 
-def test_what_surrounds_a_fault_is_no_setting_of_a_run_that_is_kept_whole(small: Path) -> None:
+def test_windows_around_events_need_a_flight_recorder(small: Path) -> None:
     with pytest.raises(ConfigError) as refused:
         resolve(load(small, ["record={ before = '2 s' }"]))
-    assert str(refused.value) == ("record.before = 2.0: needs record.keep; without it all is kept")
+    assert str(refused.value) == (
+        "record.before = 2.0: this needs record.keep; without it everything is kept"
+    )

@@ -15,6 +15,13 @@ from rack.boards.config.reference import Key, find_tables, key_tables
 from rack.boards.errors import ConfigError
 from tests.boards.conftest import MakeConfig
 
+UNITS = {
+    "",
+    *("s", "ms", "us", "1/s", "Hz", "ticks", "cycles"),
+    *("m", "mm", "m/s", "rad", "rad/s", "rad/s2", "rad/s3", "m or rad", "m/s or rad/s"),
+    *("N", "N m", "N or N m", "N/m", "N m/rad", "N/m or N m/rad", "N s/m or N m s/rad"),
+    *("N/(m s)", "kg m2"),
+}
 DIMENSIONLESS = {
     *(
         "speed",
@@ -106,6 +113,7 @@ def test_the_reference_has_every_key_of_every_shipped_config_with_meaning_and_un
             assert key.meaning, f"{place}.{key.name}"
             if "number" in key.type and key.name not in DIMENSIONLESS:
                 assert key.unit, f"{place}.{key.name}: {key.meaning}"
+            assert key.unit in UNITS, f"{place}.{key.name}: {key.meaning}"
             for suffix, unit in (("_ms", "ms"), ("_s", "s"), ("_hz", "Hz")):
                 assert not key.name.endswith(suffix) or key.unit == unit
 

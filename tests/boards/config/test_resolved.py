@@ -1,68 +1,15 @@
-"""A resolved rack: what its launch has to say, and when it is refused."""
+"""A resolved rack: the wiring of its clock, its priorities and cores."""
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator
 from pathlib import Path
-from resource import RLIMIT_MEMLOCK, getrlimit
 
 import pytest
 
-from rack.backplane.segment import Segment, unlink
-from rack.backplane.words import Block, Demand
+from rack.backplane.words import Demand
 from rack.boards.config.loader import load
-from rack.boards.config.resolved import Resolved, resolve
-from rack.boards.errors import LaunchError
+from rack.boards.config.resolved import resolve
 from tests.boards.conftest import MakeConfig
-
-REFUSED = "SCHED_FIFO refused, ordinary scheduling for wave"
-
-
-@pytest.fixture
-def memory(config: MakeConfig) -> Iterator[tuple[Resolved, Segment]]:
-    """A rack of which one board wants a real-time priority, and its memory."""
-    plan = resolve(
-        config("clock.mode=realtime", "clock.on_no_realtime=refuse", "board.wave.priority=50")
-    )
-    segment = Segment.create(plan.layout, "")
-    yield plan, segment
-    unlink(segment.rack)
-    segment.close()
-
-
-def test_a_priority_that_was_refused_is_noted_and_refuses_the_launch_if_asked(
-    memory: tuple[Resolved, Segment], config: MakeConfig
-) -> None:
-    plan, segment = memory
-    for task in plan.layout.tasks:
-        segment.block(task.name)[Block.PRIORITY] = task.priority
-    plan.check_realtime(segment)
-    assert not [note for note in plan.notes(segment) if "SCHED_FIFO" in note]
-    segment.block("wave")[Block.PRIORITY] = 0
-    (note,) = [note for note in plan.notes(segment) if "SCHED_FIFO" in note]
-    assert note.startswith(f"{REFUSED}; missed deadlines are likely")
-    with pytest.raises(LaunchError, match=REFUSED):
-        plan.check_realtime(segment)
-    # In lockstep there are no deadlines to miss.
-    stepped = resolve(config("clock.on_no_realtime=refuse", "board.wave.priority=50"))
-    stepped.check_realtime(segment)
-    assert not [note for note in stepped.notes(segment) if "SCHED_FIFO" in note]
-
-
-def test_memory_that_could_not_be_locked_is_said_with_its_limit(
-    memory: tuple[Resolved, Segment], config: MakeConfig
-) -> None:
-    plan, segment = memory
-    for task in plan.layout.tasks:
-        # The test's own process, which locks none.
-        segment.block(task.name)[Block.PID] = os.getpid()
-    limit = getrlimit(RLIMIT_MEMLOCK)[0]
-    said = f"memory not locked for wave, wave.planner, watch: the limit is {limit} bytes, a board "
-    for found, count in ((plan, 1), (resolve(config()), 0)):
-        assert [note.startswith(said) for note in found.notes(segment) if "not locked" in note] == [
-            True
-        ] * count
 
 
 def test_the_clock_is_wired_in_ticks(config: MakeConfig) -> None:
@@ -83,16 +30,6 @@ def test_the_clock_is_wired_in_ticks(config: MakeConfig) -> None:
     assert all(isinstance(demand, Demand) for demand in clock.on_loss.values())
     assert plan.clock(None).stop_tick == 0
     assert plan.clock(1e-9).stop_tick == 1
-
-
-def test_a_launch_says_whether_idle_cores_are_held_awake(
-    memory: tuple[Resolved, Segment], config: MakeConfig
-) -> None:
-    plan, segment = memory
-    assert not [note for note in plan.notes(segment) if "idle_cores" in note]
-    awake = resolve(config("clock.mode=realtime", "clock.idle_cores=awake"))
-    (note,) = [note for note in awake.notes(segment) if "idle_cores" in note]
-    assert note.startswith('clock.idle_cores = "awake": ')
 
 
 @pytest.mark.parametrize(
@@ -121,7 +58,7 @@ def test_the_crate_is_below_every_real_time_executor(
     ],
     ids=["without locks", "locks on one core", "locks on two boards"],
 )
-def test_a_planner_that_may_hold_a_lock_has_its_executors_priority_meanwhile(
+def test_a_planner_runs_at_its_executors_priority_while_it_may_hold_a_lock(
     small: Path, settings: list[str], expected: int
 ) -> None:
     priorities = ["board.lower.priority=50", "board.upper.priority=40"]
@@ -135,7 +72,7 @@ def test_a_planner_that_may_hold_a_lock_has_its_executors_priority_meanwhile(
     assert [task.task for task in plan.tasks if task.guards_clock] == ["lower"]
 
 
-def test_in_lockstep_the_clock_is_on_the_core_of_the_fastest_board_that_gives_it_away(
+def test_in_lockstep_the_clock_shares_the_core_of_the_fastest_board_that_yields(
     small: Path,
 ) -> None:
     cores = ["clock.core=0", "board.upper.core=0", "board.lower.core=1"]

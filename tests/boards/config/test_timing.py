@@ -30,7 +30,7 @@ def test_plan_within_ms_is_not_part_of_the_budget(small: Path) -> None:
     }
 
 
-def test_budgets_survive_being_put_into_a_config(small: Path) -> None:
+def test_budgets_written_to_a_config_are_read_back_unchanged(small: Path) -> None:
     upper = Budget(process_ns=3, exchange_ns=5)
     changed = loads(with_budgets(load(small, [WITHIN]), {"lower": MEASURED, "upper": upper}).text())
     # The upper level has no planner, and so no plan to read.
@@ -51,7 +51,7 @@ def test_planner_times_without_a_planner_are_a_mistake(small: Path, table: str, 
     assert wire(load(small, [f"board.upper.{table}.{key}=0", f"board.lower.{table}.{key}=1.5"]))
 
 
-def test_tasks_are_on_the_cores_that_the_config_asks_for(small: Path) -> None:
+def test_tasks_are_on_the_cores_that_the_config_requests(small: Path) -> None:
     settings = [
         "core=7",
         "coupling=loose",

@@ -99,7 +99,7 @@ def heard(
         (1, "ü" * 100, f"contact: 3.25 N m, {'ü' * 72}"),
     ],
 )
-def test_a_finding_of_a_levels_own_has_its_name_value_and_unit(
+def test_a_finding_that_a_level_declares_has_its_name_value_and_unit(
     segment: Segment, number: int, said: str, text: str
 ) -> None:
     event = heard(segment, "wave", Alarm.OWN, number, 3.25, text=said)
@@ -230,7 +230,7 @@ def test_a_fault_names_its_target(
     )
 
 
-def test_the_end_of_a_fault_says_how_often_it_acted(segment: Segment) -> None:
+def test_the_end_of_a_fault_reports_how_often_it_acted(segment: Segment) -> None:
     FaultTable(segment).entries[2].acted(400)
     event = heard(segment, CLOCK, Alarm.FAULT_ENDS, 2, 1.0)
     assert (event.code, event.value, event.text) == ("ends", 1.0, "kill ends; acted 1 time")

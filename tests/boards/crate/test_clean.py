@@ -105,7 +105,7 @@ def test_a_rack_removed_and_launched_meanwhile_is_not_removed(
     again.close()
 
 
-def test_what_another_removes_and_launches_anew_at_that_moment_stays(
+def test_a_rack_relaunched_during_the_check_is_not_removed(
     spec: Layout, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     leave_dead(spec)
@@ -156,7 +156,7 @@ def contend(spec: Layout, start: Segment, word: int) -> bool:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("trial", range(4))
-def test_of_several_launches_one_takes_a_dead_racks_name_and_keeps_it(
+def test_one_of_several_launches_takes_and_keeps_a_dead_racks_name(
     spec: Layout, rack_name: str, trial: int
 ) -> None:
     leave_dead(spec)
@@ -197,7 +197,7 @@ def test_a_foreign_entry_is_named_and_left_alone(rack_name: str, tmp_path: Path,
         place.rmdir() if kind == "directory" else place.unlink()
 
 
-def test_a_rack_of_another_pid_namespace_is_not_taken_for_the_own_one(spec: Layout) -> None:
+def test_a_rack_of_another_pid_namespace_is_not_mistaken_for_ones_own(spec: Layout) -> None:
     # Every container has a process 1.
     segment = Segment.create(spec, "")
     segment.words[Head.LAUNCHER_NAMESPACE] += 1
@@ -208,7 +208,7 @@ def test_a_rack_of_another_pid_namespace_is_not_taken_for_the_own_one(spec: Layo
     segment.close()
 
 
-def test_only_the_own_racks_of_a_process_are_removed_by_it(spec: Layout, rack_name: str) -> None:
+def test_a_process_removes_only_the_racks_that_it_launched(spec: Layout, rack_name: str) -> None:
     own = Segment.create(spec, "")
     other = layout(f"{rack_name}-other")
     assert exit_status(fork(lambda: Segment.create(other, "").close())) == 0

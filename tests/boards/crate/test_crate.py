@@ -30,7 +30,7 @@ def line() -> Iterator[CrateLine]:
     line.close(0)
 
 
-def test_a_line_says_when_its_other_end_is_gone_even_in_half_a_message() -> None:
+def test_a_line_reports_a_lost_other_end_even_within_a_message() -> None:
     ours, theirs = Pipe()
     theirs.send("whole")
     # The length of a message that never comes whole.
@@ -48,7 +48,7 @@ def test_a_crate_that_does_not_end_is_killed() -> None:
     assert not runs(line.pid)
 
 
-def test_what_a_crate_has_preloaded_it_does_not_preload_again(line: CrateLine) -> None:
+def test_a_crate_preloads_each_class_once(line: CrateLine) -> None:
     wanted = Preload(("wave_levels:Preloaded",), PATH)
     line.send(wanted)
     line.send(wanted)

@@ -75,12 +75,12 @@ def told(journal: Journal) -> list[tuple[str, str]]:
     return found
 
 
-def test_the_rack_starts_its_own_and_no_prompts(site: Site) -> None:
+def test_the_rack_starts_its_host_boards_except_external_ones(site: Site) -> None:
     assert [cast(PowerOn, request).name for request in site.asked] == ["clock", "program"]
     assert "prompt" not in site.recovery.wirings
 
 
-def test_one_that_ends_is_restarted_so_many_times_within_a_time(
+def test_a_host_board_that_ends_is_restarted_a_limited_number_of_times(
     site: Site, journal: Journal
 ) -> None:
     for tick in (10, 20, 30):
@@ -98,7 +98,7 @@ def test_one_that_ends_is_restarted_so_many_times_within_a_time(
     assert not site.recovery.given_up
 
 
-def test_one_whose_program_is_done_is_not_restarted(site: Site, journal: Journal) -> None:
+def test_a_host_board_whose_program_is_done_is_not_restarted(site: Site, journal: Journal) -> None:
     site.block[Block.STATE] = TaskState.ENDED
     site.lose(0, 10)
     assert told(journal) == [("done", "host board 'program': its program is done")]
@@ -107,7 +107,7 @@ def test_one_whose_program_is_done_is_not_restarted(site: Site, journal: Journal
 
 
 @pytest.mark.filterwarnings(FORKS)
-def test_one_that_a_signal_has_stopped_is_ended_once(site: Site, journal: Journal) -> None:
+def test_a_host_board_stopped_by_a_signal_is_killed_once(site: Site, journal: Journal) -> None:
     with forked(signal.pause) as pid:
         site.block[Block.PID] = pid
         site.asked.clear()

@@ -46,7 +46,7 @@ def run(config: RackConfig, seconds: float) -> tuple[Outcome, list[Event], dict[
         (4, 0.05, 4, 3),
     ],
 )
-def test_the_fraction_is_rounded_up_but_never_permits_to_lose_all(
+def test_the_permitted_fraction_is_rounded_up_but_never_permits_losing_every_cycle(
     due: int, fraction: float, plan: int, permitted: int
 ) -> None:
     assert _permit(due, fraction, plan) == permitted

@@ -60,7 +60,7 @@ def test_a_held_core_is_refused_with_its_holder(config: MakeConfig, first: Rack)
 
 @pytest.mark.slow
 @needs_fifo
-def test_a_rack_that_shares_says_so(config: MakeConfig, first: Rack) -> None:
+def test_a_rack_that_shares_a_core_reports_it(config: MakeConfig, first: Rack) -> None:
     with Rack(second(config, first, "board.wave.core=0")) as rack:
         # Before all else: what follows takes long while other boards have the core.
         event = rack.events[0]

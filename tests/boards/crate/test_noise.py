@@ -164,9 +164,7 @@ def copy(ran: Ran, rack_name: str) -> Iterator[Segment]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("region", REGIONS)
-def test_whoever_looks_at_a_damaged_rack_refuses_it_or_looks(
-    region: str, ran: Ran, copy: Segment
-) -> None:
+def test_every_tool_refuses_or_reads_a_damaged_rack(region: str, ran: Ran, copy: Segment) -> None:
     refused = 0
     end = copy.map.size
     for seed in range(SEEDS):

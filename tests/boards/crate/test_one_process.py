@@ -14,7 +14,7 @@ from tests.shared_runs import small_run
 
 
 @pytest.mark.slow
-def test_levels_do_what_they_do_in_a_rack_in_lockstep(
+def test_levels_behave_as_in_a_rack_in_lockstep(
     small: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     recording = Recording(small_run(tmp_path_factory))
@@ -29,11 +29,11 @@ def test_levels_do_what_they_do_in_a_rack_in_lockstep(
             assert rack.newest(name).record[()] == recording.rows(name)["message"][row], name
 
 
-def test_what_is_not_there_is_said(small: Path) -> None:
+def test_missing_mailboxes_and_messages_are_reported(small: Path) -> None:
     with OneProcess.from_file(small) as rack:
         with pytest.raises(LookupError, match=r"^'lower\.status' is empty at tick -1$"):
             rack.newest("lower.status")
-        with pytest.raises(LookupError, match=r"^no mailbox 'lower'; there are: .*lower\.status"):
+        with pytest.raises(LookupError, match=r"^no mailbox 'lower'; mailboxes: .*lower\.status"):
             rack.newest("lower")
 
 
@@ -48,7 +48,7 @@ def test_what_is_not_there_is_said(small: Path) -> None:
         ("penn", [], "a host board, which is a process of its own|a queue, an exchange"),
     ],
 )
-def test_what_only_a_rack_with_boards_has_is_refused(
+def test_features_that_need_processes_are_refused(
     small: Path, config: str, overrides: list[str], reason: str
 ) -> None:
     with pytest.raises(LaunchError, match=reason):

@@ -28,7 +28,7 @@ def dropped(lines: int) -> str:
     return f"host board 'general': {lines} lines dropped so far; a run keeps the first {MOST}\n"
 
 
-def test_lines_are_whole_or_cut_and_what_has_not_ended_waits() -> None:
+def test_complete_lines_are_split_and_an_incomplete_line_waits() -> None:
     long = b"x" * LONGEST_LINE
     assert lines_of(b"one\n\ntwo\nthr") == [b"one\n", b"\n", b"two\n"]
     assert lines_of(long[:-1]) == []
@@ -37,7 +37,7 @@ def test_lines_are_whole_or_cut_and_what_has_not_ended_waits() -> None:
     assert lines_of(long + b"rest\n") == [long, b"rest\n"]
 
 
-def test_a_line_that_comes_in_pieces_is_passed_on_once_it_is_whole(
+def test_a_line_in_pieces_is_copied_once_it_is_complete(
     printed: HostOutput, capfd: pytest.CaptureFixture[str]
 ) -> None:
     for piece, whole in ((b"on", ""), (b"e\ntw", "one\n"), (b"o\n", "two\n")):
@@ -49,7 +49,7 @@ def test_a_line_that_comes_in_pieces_is_passed_on_once_it_is_whole(
     assert capfd.readouterr().out == ""
 
 
-def test_the_last_line_needs_no_end_when_its_board_is_over(
+def test_the_last_line_of_an_ended_board_needs_no_line_end(
     printed: HostOutput, capfd: pytest.CaptureFixture[str]
 ) -> None:
     os.write(printed.writer, b"one\ntwo")
@@ -59,7 +59,7 @@ def test_the_last_line_needs_no_end_when_its_board_is_over(
     assert capfd.readouterr().out == ""
 
 
-def test_a_run_keeps_the_first_lines_and_says_each_time_that_the_dropped_ones_have_doubled(
+def test_a_run_keeps_the_first_lines_and_reports_each_doubling_of_dropped_lines(
     printed: HostOutput, capfd: pytest.CaptureFixture[str]
 ) -> None:
     said = []

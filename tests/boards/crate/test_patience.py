@@ -103,7 +103,7 @@ def test_each_class_has_its_own_time_limit_and_compiling_a_longer_one(clock: Clo
     assert lines[0] == "compiling 'terms', which is kept for later launches, 2 s so far"
 
 
-def test_a_crate_that_does_not_open_is_named_with_what_it_does(clock: Clock) -> None:
+def test_a_crate_that_does_not_open_is_reported_with_its_activity(clock: Clock) -> None:
     assert opened(clock)[1] == "the crate is starting: not done within 60 s"
     assert opened(clock, (0.0, Preloading("a:B")))[1] == "preloading 'a:B': not done within 60 s"
     why = opened(clock, (0.0, Compiling("terms")))[1]
@@ -111,14 +111,14 @@ def test_a_crate_that_does_not_open_is_named_with_what_it_does(clock: Clock) -> 
     assert opened(clock, output="one\ntwo")[1] == "one\ntwo"
 
 
-def test_a_crate_that_fails_or_ends_says_why(clock: Clock) -> None:
+def test_a_crate_that_fails_or_ends_is_reported_with_the_reason(clock: Clock) -> None:
     failed = PreloadFailed("a:B", "no such file")
     assert opened(clock, (0.0, failed))[1] == "'a:B' cannot be preloaded: no such file"
     assert opened(clock, (0.0, None))[1] == "the crate has ended"
     assert opened(clock, (0.0, None), output="killed")[1] == "killed"
 
 
-def test_a_rack_that_is_awaited_is_named_each_time_the_wait_has_doubled(
+def test_a_wait_for_another_rack_is_reported_each_time_it_has_doubled(
     clock: Clock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     waits = [("lan", "waits for rack 'b'")]

@@ -125,7 +125,7 @@ def test_boards_are_ready_before_the_clock_runs_and_a_stop_from_outside_ends_the
     assert rack.config.name not in racks()
 
 
-def test_a_run_that_its_crate_cuts_short_ends_in_the_tick_that_it_had_begun(
+def test_a_run_ended_by_the_loss_of_its_crate_ends_in_the_tick_that_had_begun(
     config: MakeConfig,
 ) -> None:
     with Rack(config("clock.mode=realtime")) as rack:

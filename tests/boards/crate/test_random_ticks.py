@@ -74,14 +74,14 @@ def strays(config: RackConfig, seconds: float | None, count: int, expected: str 
 @pytest.mark.thorough
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("run", RUNS)
-def test_nasrem_goes_on_from_random_ticks(run: str, rack_name: str) -> None:
+def test_nasrem_continues_from_random_ticks(run: str, rack_name: str) -> None:
     settings, faults = RUNS[run]
     config = load("nasrem", [f"name={rack_name}", "clock.mode=lockstep", *settings], faults)
     assert strays(config, SECONDS, COUNT) == []
 
 
 @pytest.mark.slow
-def test_a_rack_with_restarts_and_holds_goes_on_from_some_ticks(rack_name: str) -> None:
+def test_a_rack_with_restarts_and_holds_continues_from_some_ticks(rack_name: str) -> None:
     settings = [f"name={rack_name}", "clock.mode=lockstep", HOLDS]
     assert strays(load("nasrem", settings, "kill-each-board"), 4.0, 2) == []
 
@@ -101,7 +101,7 @@ def rack_of(run: str, name: str) -> tuple[RackConfig, float | None]:
 @pytest.mark.thorough
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("run", [run for run in golden.RUNS if not run.startswith(golden.HOSTED)])
-def test_a_shipped_rack_goes_on_from_random_ticks(run: str, rack_name: str) -> None:
+def test_a_shipped_rack_continues_from_random_ticks(run: str, rack_name: str) -> None:
     config, seconds = rack_of(run, rack_name)
     assert strays(config, seconds, OF_SHIPPED, golden.read()["digests"][run]) == []
 
@@ -109,7 +109,7 @@ def test_a_shipped_rack_goes_on_from_random_ticks(run: str, rack_name: str) -> N
 @pytest.mark.thorough
 @pytest.mark.timeout(480)
 @pytest.mark.parametrize("system", golden.HOSTED)
-def test_a_shipped_rack_with_host_programs_goes_on_with_what_they_sent(
+def test_a_shipped_rack_with_host_programs_continues_with_their_recorded_messages(
     system: str, rack_name: str, tmp_path: Path
 ) -> None:
     config, _ = rack_of(system, rack_name)

@@ -102,7 +102,7 @@ def test_a_board_that_is_lost_too_often_is_given_up_and_the_latch_is_set(
 
 
 @pytest.mark.slow
-def test_restarts_are_counted_over_their_time_alone(config: MakeConfig) -> None:
+def test_restarts_are_counted_within_their_time_window_only(config: MakeConfig) -> None:
     faults = [kill("wave", 50 + 400 * k) for k in range(4)]
     settings = ("supervision.restarts=1", "supervision.within_s=0.9")
     outcome, _ = run(faulty(config(*settings), *faults), 5.0)
@@ -111,7 +111,7 @@ def test_restarts_are_counted_over_their_time_alone(config: MakeConfig) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("on_loss", "demand"), [("hold", []), ("stop", [1.0, 0.0])])
-def test_a_loss_demands_of_the_arm_as_configured(
+def test_a_loss_has_the_configured_effect_on_the_arm(
     config: MakeConfig, on_loss: str, demand: list[float]
 ) -> None:
     settled = config(f"board.wave.on_loss={on_loss}")

@@ -27,7 +27,7 @@ FIVE_MAY = 65_524
 @pytest.mark.slow
 @as_root
 @pytest.mark.filterwarnings(FORKS)
-def test_a_restart_that_the_system_refuses_is_said_and_ends_the_run_in_order(
+def test_a_restart_that_the_system_refuses_is_reported_and_ends_the_run_properly(
     config: MakeConfig, tmp_path: Path, rack_name: str
 ) -> None:
     path, out = tmp_path / "limited.toml", tmp_path / "out"

@@ -38,7 +38,7 @@ def ticks(shelf: SnapshotShelf) -> list[int]:
     return sorted(snapshot.tick for snapshot in shelf._held)
 
 
-def test_the_nearest_one_before_a_tick_is_found(shelf: SnapshotShelf) -> None:
+def test_the_nearest_snapshot_before_a_tick_is_found(shelf: SnapshotShelf) -> None:
     for tick in (0, 100, 50):
         hold(shelf, tick)
     found = [shelf.nearest(tick) for tick in (0, 49, 50, 99, 1000)]
@@ -46,7 +46,7 @@ def test_the_nearest_one_before_a_tick_is_found(shelf: SnapshotShelf) -> None:
     assert shelf.nearest(-1) is None
 
 
-def test_of_many_the_first_and_the_newest_stay_and_older_ones_are_further_apart(
+def test_the_first_and_newest_snapshots_stay_and_older_ones_are_thinned_out(
     shelf: SnapshotShelf,
 ) -> None:
     for tick in range(0, 1000, 10):
@@ -59,7 +59,7 @@ def test_of_many_the_first_and_the_newest_stay_and_older_ones_are_further_apart(
     assert min(gaps[:middle]) > max(gaps[-middle // 2 :])
 
 
-def test_the_memory_of_all_is_bounded(
+def test_the_memory_of_all_snapshots_is_bounded(
     shelf: SnapshotShelf, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(shelf, "_most_bytes", 5 * SIZE)
@@ -70,7 +70,7 @@ def test_the_memory_of_all_is_bounded(
     assert len(shelf) == 5
 
 
-def test_one_of_the_same_tick_takes_the_place_of_the_other(shelf: SnapshotShelf) -> None:
+def test_a_snapshot_replaces_one_of_the_same_tick(shelf: SnapshotShelf) -> None:
     hold(shelf, 7)
     hold(shelf, 7)
     assert ticks(shelf) == [7]

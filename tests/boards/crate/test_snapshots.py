@@ -85,7 +85,7 @@ def faulty(config: RackConfig, *faults: dict[str, Any]) -> RackConfig:
 
 
 @pytest.mark.parametrize("settings", [(), LOOSE, ("protocol.default=lock",)])
-def test_a_run_goes_on_from_each_snapshot_to_the_same_digest(
+def test_a_run_continues_from_each_snapshot_to_the_same_digest(
     config: MakeConfig, crate: WarmCrate, settings: Sequence[str]
 ) -> None:
     rack = config(*settings)
@@ -100,7 +100,7 @@ def test_a_run_goes_on_from_each_snapshot_to_the_same_digest(
 
 
 @pytest.mark.parametrize("level", ["Rememberer", "Holder"])
-def test_all_that_a_level_has_is_in_a_snapshot(
+def test_a_snapshot_contains_the_whole_state_of_a_level(
     config: MakeConfig, crate: WarmCrate, level: str
 ) -> None:
     rack = config(text=REMEMBERING.replace("Rememberer", level))
@@ -112,7 +112,7 @@ def test_all_that_a_level_has_is_in_a_snapshot(
         assert continued(rack, crate, tick).digest == expected.digest
 
 
-def test_what_goes_on_from_a_snapshot_has_snapshots_that_go_on(
+def test_a_continued_run_has_snapshots_that_can_be_continued(
     config: MakeConfig, crate: WarmCrate
 ) -> None:
     rack = config(text=REMEMBERING.replace("Rememberer", "Holder"))
@@ -141,9 +141,7 @@ def test_a_snapshot_shows_the_attributes_of_its_levels(
     assert not {"context", "_call", "_next"} & set(shown)
 
 
-def test_a_task_that_has_ended_ends_the_run_that_goes_on(
-    config: MakeConfig, crate: WarmCrate
-) -> None:
+def test_a_finished_task_ends_the_continued_run(config: MakeConfig, crate: WarmCrate) -> None:
     rack = config("board.wave.params.done_at=100")
     with Rack(rack) as plain:
         expected = plain.run()
@@ -153,7 +151,7 @@ def test_a_task_that_has_ended_ends_the_run_that_goes_on(
     assert outcome.digest == expected.digest
 
 
-def test_a_branch_goes_another_way_from_its_snapshot(config: MakeConfig, crate: WarmCrate) -> None:
+def test_a_branch_differs_after_its_snapshot(config: MakeConfig, crate: WarmCrate) -> None:
     rack = config(text=REMEMBERING)
     outcome, _ = taken(rack, crate, SnapshotPolicy(part=0, at=210))
     other = config("board.wave.params.factor=2.0", text=REMEMBERING)
@@ -166,7 +164,7 @@ def test_a_branch_goes_another_way_from_its_snapshot(config: MakeConfig, crate: 
     assert continued(rack, crate, 210).digest == outcome.digest
 
 
-def test_a_run_with_faults_restarts_and_skipped_ticks_goes_on(
+def test_a_run_with_faults_restarts_and_skipped_ticks_can_be_continued(
     config: MakeConfig, crate: WarmCrate
 ) -> None:
     rack = faulty(
@@ -248,7 +246,7 @@ def test_snapshots_end_with_their_crate_however_that_ends(config: MakeConfig) ->
         assert not any(map(is_alive, pids))
 
 
-def test_a_snapshot_that_has_lost_a_copy_goes_whole(config: MakeConfig, crate: WarmCrate) -> None:
+def test_a_snapshot_that_has_lost_a_copy_is_dropped(config: MakeConfig, crate: WarmCrate) -> None:
     rack = config()
     outcome, _ = taken(rack, crate, SnapshotPolicy(part=0, at=100))
     earlier = copies_of(crate)
@@ -261,7 +259,7 @@ def test_a_snapshot_that_has_lost_a_copy_goes_whole(config: MakeConfig, crate: W
     assert continued(rack, crate, 250).digest == outcome.digest
 
 
-def test_a_board_that_went_on_from_a_snapshot_is_restarted_when_it_is_killed(
+def test_a_continued_board_is_restarted_when_it_is_killed(
     config: MakeConfig, crate: WarmCrate
 ) -> None:
     rack = faulty(
@@ -275,7 +273,7 @@ def test_a_board_that_went_on_from_a_snapshot_is_restarted_when_it_is_killed(
     assert restarts == [event.board for event in events if event.code == "restart"] == ["wave"]
 
 
-def test_a_running_rack_states_how_many_snapshots_there_are(
+def test_a_running_rack_publishes_its_number_of_snapshots(
     config: MakeConfig, crate: WarmCrate
 ) -> None:
     with Rack(config(), crate=crate, snapshots=OFTEN) as rack:

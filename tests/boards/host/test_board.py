@@ -99,7 +99,7 @@ def test_a_program_sends_every_number_once_and_its_return_ends_the_run(config: M
 
 
 @pytest.mark.slow
-def test_hung_dead_failed_and_finished_programs_leave_the_real_time_side_as_it_is_without_them(
+def test_hung_dead_failed_and_finished_programs_do_not_affect_the_real_time_side(
     config: MakeConfig,
 ) -> None:
     text = others(hung="Waiting", failed="Failing", finished="Ending", killed="Waiting")
@@ -139,7 +139,7 @@ def test_hung_dead_failed_and_finished_programs_leave_the_real_time_side_as_it_i
 
 
 @pytest.mark.slow
-def test_a_program_that_keeps_every_signal_out_ends_with_its_rack_and_all_that_it_started(
+def test_a_program_that_blocks_every_signal_ends_with_its_rack_and_its_children(
     config: MakeConfig,
 ) -> None:
     # The fixture checks that no process is left.
@@ -156,7 +156,7 @@ def daemons(rack: Rack) -> list[int]:
 
 
 @pytest.mark.slow
-def test_a_daemon_in_a_session_of_its_own_ends_with_its_host_board(
+def test_a_daemon_in_another_session_ends_with_its_host_board(
     config: MakeConfig,
 ) -> None:
     with Rack(

@@ -67,7 +67,7 @@ def test_a_message_without_an_id_has_its_number(
     assert program.numbers.sent == 3
 
 
-def test_a_message_that_is_not_sent_stays_as_it_is(
+def test_a_message_that_cannot_be_sent_is_not_cleared(
     make_site: MakeSite, open_program: OpenProgram
 ) -> None:
     site = make_site()
@@ -113,7 +113,7 @@ def test_the_crates_memory_is_read_by_bus_addresses(make_site: MakeSite, open_bu
         bus.address("x")
 
 
-def test_in_real_time_a_program_waits_for_a_message_or_its_time(
+def test_in_real_time_a_program_waits_for_a_message_or_its_timeout(
     make_site: MakeSite, open_bus: OpenBus
 ) -> None:
     site = make_site("clock.mode=realtime")
@@ -134,7 +134,9 @@ def test_in_real_time_a_program_waits_for_a_message_or_its_time(
     assert done_semaphore(site.segment, "program").value == 0
 
 
-def test_in_lockstep_time_is_that_of_its_turns(make_site: MakeSite, open_bus: OpenBus) -> None:
+def test_in_lockstep_a_programs_time_is_the_tick_of_its_turn(
+    make_site: MakeSite, open_bus: OpenBus
+) -> None:
     site = make_site("host.program.computing_ms=5")
     site.segment.words[System.LOCKSTEP] = 1
     site.host[Block.RELEASED] = 8

@@ -17,7 +17,7 @@ from tests.boards.host.conftest import EVERY, MakeSite, OpenBus, OpenProgram, co
 NEWEST = ("board.bridge.params.pass.numbers.asynchronous=false",)
 
 
-def test_each_message_crosses_once_and_in_order_as_many_as_a_cycle_may_take(
+def test_each_message_passes_once_and_in_order_up_to_the_limit_of_a_cycle(
     make_site: MakeSite, open_program: OpenProgram
 ) -> None:
     site = make_site("board.bridge.params.pass.numbers.most=3")
@@ -35,7 +35,7 @@ def test_each_message_crosses_once_and_in_order_as_many_as_a_cycle_may_take(
     assert site.count("numbers") == {"passed": 5, "arrived": 4, "age": 8}
 
 
-def test_of_messages_that_are_sampled_the_newest_crosses(
+def test_only_the_newest_of_sampled_messages_passes(
     make_site: MakeSite, open_program: OpenProgram
 ) -> None:
     site = make_site(*NEWEST)
@@ -49,7 +49,7 @@ def test_of_messages_that_are_sampled_the_newest_crosses(
 
 
 @pytest.mark.parametrize("settings", [(), NEWEST])
-def test_what_no_number_may_be_is_refused_and_counted(
+def test_invalid_values_are_refused_and_counted(
     make_site: MakeSite, open_program: OpenProgram, settings: tuple[str, ...]
 ) -> None:
     site = make_site(*settings)
@@ -62,7 +62,7 @@ def test_what_no_number_may_be_is_refused_and_counted(
     assert not any(site.crossed())
 
 
-def test_a_full_ring_refuses_and_the_bridge_says_how_often(
+def test_a_full_ring_refuses_messages_and_the_bridge_counts_them(
     make_site: MakeSite, open_program: OpenProgram
 ) -> None:
     site = make_site()
@@ -74,7 +74,7 @@ def test_a_full_ring_refuses_and_the_bridge_says_how_often(
     assert site.count("numbers")["full"] == 2
 
 
-def test_what_a_program_still_computes_does_not_cross(
+def test_messages_do_not_pass_before_the_computing_time_is_over(
     make_site: MakeSite, open_program: OpenProgram
 ) -> None:
     site = make_site()
@@ -86,7 +86,7 @@ def test_what_a_program_still_computes_does_not_cross(
     assert site.count("numbers") == {"passed": 1, "arrived": EVERY, "age": EVERY}
 
 
-def test_a_restarted_bridge_counts_on_and_repeats_what_it_said(
+def test_a_restarted_bridge_continues_its_counters_and_repeats_its_messages(
     make_site: MakeSite, open_program: OpenProgram
 ) -> None:
     site = make_site(*NEWEST)
@@ -149,7 +149,7 @@ STATES = [
 
 
 @pytest.mark.parametrize(("state", "lost", "expected", "reason"), STATES)
-def test_a_bridge_says_how_its_programs_are(
+def test_the_status_of_a_bridge_reports_its_programs(
     make_site: MakeSite, state: TaskState, lost: int, expected: State, reason: str
 ) -> None:
     site = make_site()
@@ -190,7 +190,7 @@ class Out:
         (False, 4, [1, 3, 3]),
     ],
 )
-def test_a_replay_gives_out_what_was_written_at_its_ticks(
+def test_a_replay_writes_the_recorded_messages_at_their_ticks(
     is_sent: bool, since: int, expected: list[object]
 ) -> None:
     rows = [(0, 0, b"\1"), (4, 3, b"\2"), (8, 7, b"\3"), (12, 11, b"\4")]

@@ -74,7 +74,7 @@ def test_a_run_repeats_however_long_its_program_takes(
     assert slow(config, 0.0, *settings) == slow(config, 0.03, *settings)
 
 
-def test_a_program_that_is_done_is_not_struck_though_its_process_is_still_there(
+def test_a_fault_does_not_strike_a_finished_program_whose_process_still_exists(
     config: MakeConfig,
 ) -> None:
     settings = (
@@ -96,8 +96,8 @@ def test_a_program_that_does_not_wait_ends_the_run_with_that_reason(config: Make
     assert (outcome.cause, outcome.worked) == ("board lost", False)
     (fault,) = outcome.faults
     assert fault.startswith(
-        "board 'bridge': the program of host board 'program' has not waited for 1 s of real time:"
-        " lockstep cannot go on"
+        "board 'bridge': the program of host board 'program' has not waited for 1 s of real time,"
+        " and lockstep cannot continue"
     )
 
 

@@ -27,7 +27,7 @@ def test_boards_released_in_one_tick_follow_each_other_by_priority() -> None:
     assert places(even) == [("fast", 0, 0, "even"), ("even", 0.94, 0.22, "")]
 
 
-def test_a_board_that_is_at_work_when_the_next_begins_has_negative_slack_and_fails() -> None:
+def test_a_board_still_running_when_the_next_begins_has_negative_slack_and_fails() -> None:
     rack = timing("board.fast.budget.process_ms=1.1")
     even, odd = core_frames(rack)
     assert places(even)[0] == (*places(odd)[0][:3], "even") == ("fast", 0, -0.14, "even")
@@ -42,7 +42,7 @@ def test_a_board_that_is_at_work_when_the_next_begins_has_negative_slack_and_fai
     ]
 
 
-def test_a_board_longer_than_its_frame_fails_by_what_is_left_of_it_at_the_end() -> None:
+def test_a_board_longer_than_its_frame_fails_by_its_remaining_work() -> None:
     even, odd = core_frames(timing("board.even.budget.process_ms=3.2"))
     assert places(even)[1] == ("even", 1, -0.24, "")
     # What it takes of the next frame is missing there: 'odd' waits for it.

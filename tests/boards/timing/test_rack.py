@@ -109,7 +109,7 @@ def arm_of(*joints: str) -> RackTiming:
     return rack(*boards, *(board(name, 4, "path", "arm") for name in joints), board("alone", 500))
 
 
-def test_a_board_a_joint_is_one_hierarchy_of_parallel_chains() -> None:
+def test_one_board_per_joint_forms_one_group_of_parallel_chains() -> None:
     timing = arm_of(*JOINTS)
     assert timing.chains == tuple(("plan", "path", joint, "arm") for joint in JOINTS)
     (together,) = timing.parallel
@@ -144,7 +144,7 @@ def test_a_forecast_names_the_planners_that_it_cannot_judge() -> None:
     assert {"top", "a"} <= forecast.uncounted.keys()
 
 
-def test_a_forecast_notes_what_it_leaves_out_and_nothing_else() -> None:
+def test_a_forecast_notes_exactly_what_it_leaves_out() -> None:
     fast = TimedTask("clock", "clock", "clock", 0, 90, 2 * MS, (Part(Unit.PROCESS, MS // 10),))
     counted = replace(rack(FIGURE_3), clock=fast)
     ordinary = replace(FIGURE_3, planner_priority=70)
@@ -152,13 +152,13 @@ def test_a_forecast_notes_what_it_leaves_out_and_nothing_else() -> None:
     notes = Forecast.of(replace(counted, is_lockstep=True, speed=2.0), has_cores=False).notes
     expected = (
         "in lockstep",
-        "times are of the wall clock: speed 2",
-        "cores are those of the config",
+        "times are wall-clock times: speed 2",
+        "cores are those in the config",
     )
     assert len(notes) == len(expected)
     assert all(note.startswith(start) for note, start in zip(notes, expected, strict=True))
     queued = Forecast.of(arm_of(*JOINTS).changed("path", queues=("plan.requests",))).notes
-    assert queued[0] == "the system's response is that of empty queues: plan.requests"
+    assert queued[0] == "the system response assumes that these queues are empty: plan.requests"
     # Without a budget there is nothing to say about times.
     bare = Forecast.of(
         replace(rack(board("bare", 4)), is_lockstep=True, speed=2.0), has_cores=False

@@ -110,14 +110,12 @@ def computing(time: int) -> Part:
         ([Plain(26, 70), Plain(62, 100)], [26, 114]),
     ],
 )
-def test_published_examples_come_out(tasks: list[Plain], expected: list[int]) -> None:
+def test_published_examples_are_reproduced(tasks: list[Plain], expected: list[int]) -> None:
     assert analysed(tasks) == expected
 
 
 @pytest.mark.parametrize(("full", "most_blocked"), [(True, 0), (False, 8)])
-def test_no_set_of_tasks_responds_otherwise_than_its_schedule(
-    full: bool, most_blocked: int
-) -> None:
+def test_response_times_agree_with_simulated_schedules(full: bool, most_blocked: int) -> None:
     draw = random.Random(12)
     for _ in range(SETS):
         check_against_schedule(drawn(draw, full), draw.randint(0, most_blocked))
@@ -132,7 +130,7 @@ def test_overload_has_no_bound(above: list[Load]) -> None:
     assert response(2, above) is None
 
 
-def test_the_search_ends_at_its_horizon_or_when_it_creeps() -> None:
+def test_the_search_ends_at_its_horizon_or_after_too_many_steps() -> None:
     assert response(0, []) == 0
     # A billionth of the core is left: the end lies 10^10 jobs ahead, and before the horizon.
     assert response(500_000, [(9_999, 10_000), (99_999, 10**9)], horizon=10**15) is None
@@ -143,7 +141,7 @@ def test_the_search_ends_at_its_horizon_or_when_it_creeps() -> None:
     assert found > 100_000
 
 
-def test_two_context_switches_come_with_every_job() -> None:
+def test_every_job_includes_two_context_switches() -> None:
     tasks = [timed("high", 0, 20, 10, computing(2)), timed("low", 0, 10, 40, computing(9))]
     # 9 + 2 and two jobs of 2 + 2.
     assert response_times(tasks, 1) == {"high": 4, "low": 19}

@@ -156,7 +156,7 @@ def place(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(10))
-def test_a_schedule_is_what_computing_unit_by_unit_gives(seed: int) -> None:
+def test_a_schedule_equals_a_simulation_unit_by_unit(seed: int) -> None:
     for number in range(10):
         tasks, until = random_tasks(1000 * seed + number), 300
         chart = simulate(tasks, until)

@@ -43,7 +43,7 @@ def test_a_command_is_followed_from_release_to_release(given: int, sampled: int,
     assert NASREM.acts_at(given + 1) == acts
 
 
-def test_bounds_are_those_of_the_paper_and_of_the_grid() -> None:
+def test_bounds_follow_the_paper_and_the_releases() -> None:
     assert NASREM.bound_eq_3_2 == 4 * 400
     assert NASREM.sum_eq_3_3 == 400 + 100 + 8 + 1
     # A cycle of the first level until it is read, the sum, and up to 4 ticks: 100 is not a multiple
@@ -52,7 +52,7 @@ def test_bounds_are_those_of_the_paper_and_of_the_grid() -> None:
 
 
 @pytest.mark.parametrize("cycles", [(400, 100, 8, 1), (12, 8, 3), (7, 5), (30, 12, 9, 2), (4,)])
-def test_the_longest_on_the_grid_is_met_and_never_passed(cycles: tuple[int, ...]) -> None:
+def test_the_longest_response_is_reached_and_never_exceeded(cycles: tuple[int, ...]) -> None:
     path = path_of([str(cycle) for cycle in cycles], [TickGrid(cycle) for cycle in cycles])
     grid = int(np.lcm.reduce(cycles))
     found = [path.response(given, path.acts_at(given + 1)) for given in range(2 * grid)]

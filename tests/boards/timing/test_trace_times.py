@@ -94,7 +94,7 @@ def test_a_task_needs_its_core_from_waking_up_to_closing_the_cycle() -> None:
     assert (occupied.starts.tolist(), occupied.ends.tolist()) == ([1008, 3008], [1112, 3112])
 
 
-def test_waking_up_takes_what_the_stamps_do_not_hold_and_no_longer_than_the_lateness() -> None:
+def test_wake_up_time_is_the_unstamped_time_up_to_the_lateness() -> None:
     rows = records(*(cycle(1000, USUAL, processor) for processor in (90, 100, 104, 130)))
     assert trace_times.waking_ns(rows).tolist() == [0, 0, 4, 10]
     # Its clock board stamped the release after its start.
@@ -102,7 +102,7 @@ def test_waking_up_takes_what_the_stamps_do_not_hold_and_no_longer_than_the_late
     assert trace_times.waking_ns(rows).tolist() == [0, 0, 0, 0]
 
 
-def test_the_overhead_is_the_median_of_the_cycles_that_nobody_disturbed() -> None:
+def test_the_overhead_is_the_median_of_undisturbed_cycles() -> None:
     processors = (95, 60, 100, 104, 108)
     rows = records(*(cycle(1000, USUAL, processor) for processor in processors))
     assert trace_times.overhead_ns(rows) == 4
@@ -112,13 +112,13 @@ def test_the_overhead_is_the_median_of_the_cycles_that_nobody_disturbed() -> Non
 NOBODY = Occupation.union([])
 
 
-def test_what_a_higher_task_took_is_taken_off_the_part_in_which_it_ran() -> None:
+def test_time_of_a_higher_task_is_subtracted_from_the_part_it_interrupted() -> None:
     rows = records(cycle(0, (10, 20, 90, 30), 104))
     above = Occupation(np.array([45]), np.array([95]))
     assert trace_times.unit_times(rows, above).tolist() == [list(USUAL)]
 
 
-def test_a_disturbance_is_taken_off_the_part_that_is_longer_than_usual() -> None:
+def test_a_disturbance_is_subtracted_from_the_part_that_is_longer_than_usual() -> None:
     usual = [cycle(1000 * n, USUAL, 104) for n in range(4)]
     disturbed = cycle(5000, (10, 20, 140, 30), 104)
     # All of its time was its own: the next cycle woke up without any.

@@ -54,7 +54,7 @@ def judged(
         (2, "=", 3, False),
     ],
 )
-def test_an_equation_is_as_true_as_its_sides_make_it(
+def test_an_equation_holds_if_its_sides_satisfy_it(
     left: int, sign: Sign, right: int, holds: bool
 ) -> None:
     verdict = EquationVerdict("3.1", "level", left, sign, right, "")
@@ -103,7 +103,7 @@ def test_a_cycle_between_two_ticks_is_off_the_grid() -> None:
     assert judged(replace(TIGHT, cycle_ns=MS), "3.7", tick_ns=2_500_000) == (1, "=!", 2.5)
 
 
-def test_context_switches_come_off_the_residual_and_on_top_of_the_cycle_twice() -> None:
+def test_two_context_switches_shorten_the_residual_and_lengthen_the_cycle() -> None:
     # The paper's 100 us a switch: figure 2 with 2 ms of executor has 8 - 2 - 3 - 0.2 ms left.
     level = replace(TIGHT, **SHORTER)
     assert judged(level, "3.9", switch_ns=MS // 10) == (5.2, "<", 8)

@@ -61,7 +61,7 @@ def test_actions_of_every_kind_are_read() -> None:
             {"do": "home", "by": 0},
             (
                 "task.action[0].by = 0: should be greater than 0; simulated time by which the"
-                " action must be done, s"
+                " action must be done [s]"
             ),
         ),
         ({"do": "home", "speed": 2}, "task.action[0].speed = 2: unknown key; known: by, do"),
@@ -76,7 +76,7 @@ def test_actions_of_every_kind_are_read() -> None:
         ),
         (
             {"do": "goto", "position": [0, 0, float("nan")]},
-            "task.action[0].position[2] = nan: should be a finite number; of the tool, m",
+            "task.action[0].position[2] = nan: should be a finite number; of the tool [m]",
         ),
     ],
 )

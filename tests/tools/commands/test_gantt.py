@@ -127,7 +127,7 @@ def test_figure_5_is_printed_and_drawn(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["nosuch"], "no such file; by name: "),
+        (["nosuch"], "no such file; valid are a path or one of the names "),
         (["configs/tasks"], "configs/tasks: not a run: it has no config.toml"),
         (["crossing", "--set", "board.servo.slot=3"], "slot"),
         (["fig2", "--figure", "3"], "--figure 3: permitted: 5"),

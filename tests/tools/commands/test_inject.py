@@ -127,7 +127,7 @@ def test_what_cannot_be_is_one_line_that_says_what_can(running: str, words: str,
 
 
 IMPOSSIBLE: list[tuple[str, dict[str, str], str]] = [
-    ("drop", {"probability": "2"}, "probability = 2: out of range; permitted: 0.001 to 1; "),
+    ("drop", {"probability": "2"}, "probability = 2: out of range; valid: 0.001 to 1; "),
     ("mute", {"for": "1h"}, 'for = "1h": should be a time, as in "0.5s", "20ms" or 0.5; '),
     (
         "mute",

@@ -70,7 +70,7 @@ def outcome(tables: dict[str, Any]) -> str:
 
 
 @pytest.mark.parametrize("name", RACKS)
-def test_a_changed_value_has_the_outcome_that_it_had(
+def test_every_changed_value_has_the_recorded_outcome(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {0, 1, 2, 3})

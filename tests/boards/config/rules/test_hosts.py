@@ -19,8 +19,8 @@ MISTAKES = {
     "where determinism is demanded": (
         ["protocol.strict=true"],
         (
-            "host.program: a board without real time makes a run depend on timing, refused by"
-            " protocol.strict = true"
+            "host.program: a board without real time makes a run depend on timing, which"
+            " protocol.strict = true refuses"
         ),
     ),
     "below": (
@@ -67,7 +67,7 @@ MISTAKES = {
             ),
             "board.second.params.pass.sum={ from = 'bridge.sum' }",
         ],
-        'board.second.params.pass.sum = "bridge.sum": it is on the host side already',
+        'board.second.params.pass.sum = "bridge.sum": it is already on the host side',
     ),
     "an unknown source": (
         ["board.bridge.params.pass.more={ from = 'program.more' }"],
@@ -76,8 +76,8 @@ MISTAKES = {
     "both modes": (
         ["board.bridge.params.pass.numbers.every=2"],
         (
-            "board.bridge.params.pass.numbers: every = 2: the entry is asynchronous; permitted: one"
-            " of the two"
+            "board.bridge.params.pass.numbers: every = 2: the entry is also asynchronous; give only"
+            " one of the two"
         ),
     ),
     "a phase": (
@@ -86,11 +86,11 @@ MISTAKES = {
     ),
     "a name of an entry": (
         ["board.bridge.params.pass.status={ from = 'adder.status' }"],
-        "pass.status: invalid name; permitted: a-z, 0-9 and _, except status, ",
+        "pass.status: invalid name; valid: a-z, 0-9 and _, except status, ",
     ),
     "a fault": (
         ["host.program.external=true", "fault=[{ kind = 'kill', board = 'program', tick = 1 }]"],
-        'fault[0].board = "program": external: the rack has no process to strike',
+        'fault[0].board = "program": the rack does not start this external board',
     ),
     "a fault that needs cycles": (
         ["fault=[{ kind = 'overrun', board = 'program', tick = 1 }]", "clock.mode=realtime"],

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from rack.boards.config import load, loads, resolve
-from rack.boards.config.rules.lan import network_notes
+from rack.boards.config.rules.lan import list_network_notes
 from rack.boards.errors import ConfigError
 from rack.tools.network.certificates import make_credentials
 from tests.boards.lan.racks import rack_text
@@ -31,12 +31,12 @@ def mistakes(
 
 
 NEAR = (
-    "every user of this machine could pass for any rack here; permitted: unix/ and a name,"
-    " certificates, which seal what is sent, or by name, adapter.lan.insecure = true"
+    "every user of this machine could impersonate another rack; use unix/ and a name or"
+    " certificates, which protect messages, or accept it with adapter.lan.insecure = true"
 )
 FAR = (
-    "beyond this machine without TLS; permitted: tls/ or quic/ with certificates, an address of"
-    " loopback, or by name, adapter.lan.insecure = true"
+    "other machines can reach this endpoint without TLS; use tls/ or quic/ with certificates or a"
+    " loopback address, or accept it with adapter.lan.insecure = true"
 )
 
 
@@ -49,7 +49,7 @@ FAR = (
         ("tcp/localhost.cell:7447", FAR),
     ],
 )
-def test_tcp_is_refused_unless_asked_for_by_name_or_sealed_on_loopback(
+def test_tcp_is_refused_unless_accepted_explicitly_or_protected_on_loopback(
     tmp_path: Path, endpoint: str, why: str
 ) -> None:
     assert mistakes(tmp_path, endpoint) == [f'adapter.lan.listen[0] = "{endpoint}": {why}']
@@ -78,17 +78,19 @@ def test_a_malformed_endpoint_is_one_line(tmp_path: Path, endpoint: str, why: st
 
 def test_tls_needs_certificates(tmp_path: Path) -> None:
     (line,) = mistakes(tmp_path, TLS)
-    assert (
-        line
-        == "adapter.lan.certificates: missing; TLS needs them: see rack lan certificates --help"
+    assert line == (
+        "adapter.lan.certificates: missing; TLS needs certificates: see rack lan certificates"
+        " --help"
     )
 
 
-def test_flaws_of_all_files_come_with_the_other_mistakes(tmp_path: Path) -> None:
+def test_flaws_of_all_certificate_files_are_reported_with_the_other_mistakes(
+    tmp_path: Path,
+) -> None:
     (tmp_path / "certs").mkdir()
     lines = mistakes(tmp_path, TLS, 'certificates = "certs"', connect=("tcp/127.0.0.1:7448",))
     assert lines[0].startswith(
-        'adapter.lan.connect[0] = "tcp/127.0.0.1:7448": without TLS, which others have'
+        'adapter.lan.connect[0] = "tcp/127.0.0.1:7448": this endpoint has no TLS but others have it'
     )
     files = ("authority.pem", "cell.pem", "cell-key.pem")
     why = f"the file is missing; see rack lan certificates --help; in {tmp_path}/certs"
@@ -111,7 +113,7 @@ def test_certificates_are_found_next_to_the_config_from_anywhere(
     )
 
 
-def test_nobody_could_import_over_tls_without_being_named(tmp_path: Path) -> None:
+def test_exports_over_tls_need_named_peers(tmp_path: Path) -> None:
     make_credentials(tmp_path / "certs", {"cell": ["127.0.0.1"]}, 1)
     path = tmp_path / "rack.toml"
     path.write_text(rack_text("cell", TLS, (), lan='certificates = "certs"'))
@@ -124,54 +126,54 @@ def test_a_certificate_cannot_be_checked_for_an_address_of_ipv6(tmp_path: Path) 
     own = 'certificates = "certs"'
     assert mistakes(tmp_path, "tls/[::1]:7447", own) == []
     (line,) = mistakes(tmp_path, "", own, connect=("tls/[::1]:7447",))
-    assert "permitted: a host name, or an address of IPv4" in line
+    assert "use a host name or an IPv4 address" in line
 
 
-def test_a_launch_warns_of_certificates_that_end_soon(tmp_path: Path) -> None:
+def test_a_launch_warns_of_certificates_that_expire_soon(tmp_path: Path) -> None:
     for days, count in ((29, 1), (31, 0)):
         make_credentials(tmp_path / f"for{days}", {"cell": ["127.0.0.1"]}, days)
         assert mistakes(tmp_path, TLS, f'certificates = "for{days}"') == []
-        notes = network_notes(load(tmp_path / "rack.toml"))
+        notes = list_network_notes(load(tmp_path / "rack.toml"))
         assert [note.startswith("certificates expire on 20") for note in notes] == [True] * count
 
 
-def test_a_launch_without_tls_says_what_others_may_do(tmp_path: Path) -> None:
+def test_a_launch_without_tls_reports_possible_attacks(tmp_path: Path) -> None:
     make_credentials(tmp_path / "certs", {"cell": ["127.0.0.1"]}, 40)
     far, near, own = "tcp/10.0.0.1:7447", "tcp/127.0.0.1:7447", 'certificates = "certs"'
-    read = "read what is exchanged, and feign that racks come and go"
+    read = "read messages, and pretend that racks come and go"
     for listen, lan, note in (
         (
             near,
             "insecure = true",
-            f"without TLS: whoever reaches {near} may read and forge what is exchanged",
+            f"no TLS: whoever reaches {near} can read and forge messages",
         ),
-        (near, own, f"without TLS: whoever reaches {near} may {read}"),
+        (near, own, f"no TLS: whoever reaches {near} can {read}"),
         ("unix/cell", "", ""),
         (TLS, own, ""),
         (
             far,
             "insecure = true",
-            f"without TLS: whoever reaches {far} may read and forge what is exchanged",
+            f"no TLS: whoever reaches {far} can read and forge messages",
         ),
         (
             far,
             f"insecure = true\n{own}",
-            f"without TLS: whoever reaches {far} may {read}",
+            f"no TLS: whoever reaches {far} can {read}",
         ),
     ):
         assert mistakes(tmp_path, listen, lan) == []
-        assert network_notes(load(tmp_path / "rack.toml")) == ([note] if note else [])
+        assert list_network_notes(load(tmp_path / "rack.toml")) == ([note] if note else [])
 
 
-def test_nobody_may_stop_a_rack_where_anyone_could_pass_for_another(tmp_path: Path) -> None:
+def test_remote_stops_are_refused_on_endpoints_that_allow_impersonation(tmp_path: Path) -> None:
     make_credentials(tmp_path / "certs", {"cell": ["127.0.0.1"]}, 1)
     lan, own = 'estop_from = ["operator"]', '\ncertificates = "certs"'
     for at, more, could in (
-        ("tcp/127.0.0.1:7447", own, "repeat what one of them has asked"),
-        ("tcp/10.0.0.1:7447", "\ninsecure = true", "pass for any of them"),
+        ("tcp/127.0.0.1:7447", own, "repeat an earlier request of one of these racks"),
+        ("tcp/10.0.0.1:7447", "\ninsecure = true", "impersonate any of these racks"),
     ):
         line = (
-            f'adapter.lan.estop_from = "operator": whoever reaches {at} could {could}; permitted:'
+            f'adapter.lan.estop_from = "operator": whoever reaches {at} could {could}; use'
             " tls/ or quic/ with certificates (rack lan certificates --help), or unix/"
             " on one machine"
         )

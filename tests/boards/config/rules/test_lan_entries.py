@@ -35,9 +35,9 @@ MISTAKES = {
     "a servo loop": (
         ["board.pulse.rate_hz=400"],
         (
-            'adapter.lan.export.pulse.from = "pulse.status": written at 400 Hz, and a loop that'
-            " fast must not wait for a network; permitted: up to 50 Hz: over a network goes what"
-            " the task and elemental-move levels exchange"
+            'adapter.lan.export.pulse.from = "pulse.status": written at 400 Hz, too fast for a'
+            " loop over a network, which can run at up to 50 Hz; export the slower mailboxes of the"
+            " task and elemental-move levels"
         ),
     ),
     "no such mailbox": (
@@ -50,8 +50,8 @@ MISTAKES = {
     "a mailbox of the adapter": (
         ["adapter.lan.export.again={ from = 'lan.other' }"],
         (
-            'adapter.lan.export.again.from = "lan.other": written by the adapter itself; permitted:'
-            " mailboxes that"
+            'adapter.lan.export.again.from = "lan.other": the adapter itself writes it; only'
+            " mailboxes of levels can be exported"
         ),
     ),
     "a queue": (
@@ -65,7 +65,7 @@ MISTAKES = {
         ],
         (
             'adapter.lan.export.again.from = "sender.requests": a queue gives each message once, to'
-            " its one reader here"
+            " its reader in this rack"
         ),
     ),
     "a rack itself": (
@@ -74,19 +74,19 @@ MISTAKES = {
             " max_age_ms = 500 }"
         ],
         (
-            'adapter.lan.import.own.from = "one/pulse.status": a mailbox of this rack itself:'
-            " levels here read it"
+            'adapter.lan.import.own.from = "one/pulse.status": this mailbox belongs to this rack,'
+            " whose levels can read it"
         ),
     ),
     "a peer itself": (
         ["adapter.lan.peers=['one']"],
-        'adapter.lan.peers = "one": the name of this rack itself',
+        'adapter.lan.peers = "one": this is the name of this rack itself',
     ),
     "peers alike": (
         ["adapter.lan.peers=['a-b', 'a_b']"],
         (
-            "adapter.lan.peers = ['a-b', 'a_b']: these names differ in '-' and '_' alone, so their"
-            " mailboxes lan.peer_a_b"
+            "adapter.lan.peers = ['a-b', 'a_b']: these names differ only in '-' and '_', so they"
+            " would share mailbox lan.peer_a_b"
         ),
     ),
     "an unknown type": (
@@ -110,8 +110,8 @@ MISTAKES = {
     "too short an age": (
         ["adapter.lan.import.other.rate_hz=10"],
         (
-            "adapter.lan.import.other.max_age_ms = 100.0: between two exchanges it gets as old as"
-            " one of them and a cycle of the adapter, 120 ms; permitted: no less"
+            "adapter.lan.import.other.max_age_ms = 100.0: between two exchanges a message gets as"
+            " old as their interval and one cycle of the adapter; must be at least 120 ms"
         ),
     ),
     "an import twice": (
@@ -121,7 +121,7 @@ MISTAKES = {
         ],
         (
             'adapter.lan.import = "two/pulse.status": listed 2 times: other, again; any number of'
-            " levels may read"
+            " levels may read one port"
         ),
     ),
     "a port of the adapter's own": (
@@ -133,27 +133,30 @@ MISTAKES = {
     ),
     "a board of its name": (
         ["board.lan={ slot = 9, rate_hz = 50, executor = 'lan_levels:Pulse' }"],
-        "board.lan: [adapter.lan] makes the board of this name; rename the board, or leave one out",
+        (
+            "board.lan: [adapter.lan] adds a board of this name; rename this board, or remove one"
+            " of them"
+        ),
     ),
     "a board that is the adapter": (
         ["board.net={ slot = 9, rate_hz = 50, executor = 'rack.boards.lan.adapter:LanAdapter' }"],
         (
-            'board.net.executor = "rack.boards.lan.adapter:LanAdapter": permitted: [adapter.lan],'
-            " which makes its board"
+            'board.net.executor = "rack.boards.lan.adapter:LanAdapter": this class needs the table'
+            " [adapter.lan], which adds its board"
         ),
     ),
     "a priority below a neighbour's": (
         ["clock.mode=realtime", "adapter.lan.priority=40", "board.pulse.priority=40"],
         (
-            "adapter.lan.priority = 40: must be above that of the other boards on core 0, pulse 40:"
-            " else they keep it"
+            "adapter.lan.priority = 40: must be above the other boards on core 0, pulse 40;"
+            " otherwise they can delay"
         ),
     ),
     "determinism in real time": (
         ["clock.mode=realtime", "protocol.strict=true"],
         (
-            "adapter.lan: what other racks send makes a run depend on timing, refused by"
-            ' protocol.strict = true; permitted: clock.mode = "lockstep"'
+            "adapter.lan: messages of other racks make a run depend on timing, which"
+            ' protocol.strict = true refuses; clock.mode must be "lockstep"'
         ),
     ),
 }
@@ -174,7 +177,7 @@ def test_a_mistake_is_one_line(name: str) -> None:
     assert "board.lan." not in str(mistake)
 
 
-def test_what_is_permitted_is_permitted() -> None:
+def test_valid_tables_have_no_mistakes() -> None:
     resolved()
     resolved("protocol.strict=true")
     resolved("clock.mode=realtime", "adapter.lan.priority=41", "board.pulse.priority=40")
@@ -182,7 +185,7 @@ def test_what_is_permitted_is_permitted() -> None:
     resolved("adapter.lan.import.other.rate_hz=10", "adapter.lan.import.other.max_age_ms=120")
 
 
-def test_the_loss_of_the_adapter_is_as_bad_as_that_of_a_rack() -> None:
+def test_the_loss_of_the_adapter_has_the_same_reaction_as_the_loss_of_a_peer() -> None:
     for rule, on_loss in (("hold", "hold"), ("stop", "stop"), ("go on", "hold")):
         text = rack_text("one", "", [], "two", lan=f'on_peer_loss = "{rule}"')
         assert loads(text).board["lan"].on_loss == on_loss
@@ -225,7 +228,7 @@ def test_an_adapter_in_a_rack_without_boards_hides_no_mistake() -> None:
 
 
 @pytest.mark.slow
-def test_what_an_operator_commands_stays_in_its_rack(tmp_path: Path) -> None:
+def test_operator_commands_cannot_be_exported(tmp_path: Path) -> None:
     path = tmp_path / "arm.toml"
     table = '[adapter.lan]\nslot = 12\nlisten = ["tcp/127.0.0.1:7447"]\npeers = ["b"]\n'
     entry = '[adapter.lan.export.out]\nrate_hz = 10\nfrom = "{}"\n'
@@ -239,5 +242,5 @@ def test_what_an_operator_commands_stays_in_its_rack(tmp_path: Path) -> None:
         except ConfigError as error:
             found = str(error).splitlines()
         said = [line for line in found if line.startswith("adapter.lan.export.out.from = ")]
-        why = "what an operator commands stays in its rack; permitted: mailboxes that levels write"
+        why = "operator commands stay in their rack; only mailboxes of levels can be exported"
         assert [line.endswith(why) for line in said] == [True] * expected

@@ -33,7 +33,10 @@ MISTAKES = {
         "board.upper.slot = 22: should be less than or equal to 21; slot in",
     ),
     "slot of the clock": ("board.upper.slot=1", "slot 1 is the clock's"),
-    "slot taken": ("board.upper.slot=3", "board.lower.slot = 3: already taken by board.upper.slot"),
+    "slot taken": (
+        "board.upper.slot=3",
+        "board.lower.slot = 3: the slot is already taken by board.upper.slot",
+    ),
     "name": ("name='../x'", 'name = "../x": '),
     "period": (
         "clock.period_ms=2.4999995",
@@ -54,15 +57,18 @@ MISTAKES = {
     ),
     "truth for a number": (
         "clock.period_ms=true",
-        "clock.period_ms = true: should be a valid number; tick period, ms",
+        "clock.period_ms = true: should be a valid number; tick period [ms]",
     ),
     "short tick in real time": (
         "clock={ mode = 'realtime', speed = 500 }",
-        "clock.speed = 500.0: a tick would take 0.005 ms of real time; permitted: 0.01 ms or more",
+        (
+            "clock.speed = 500.0: a tick would take 0.005 ms of real time; it must take 0.01 ms or"
+            " more"
+        ),
     ),
     "very long cycle": (
         "board.lower={ rate_hz = 1e-5 }",
-        "a cycle would take 40000000 ticks; permitted: up to 1000000",
+        "a cycle would take 40000000 ticks; it can take up to 1000000",
     ),
     "port of no executor": (
         "board.upper.exchange={ command = { every = 2 } }",
@@ -70,17 +76,17 @@ MISTAKES = {
     ),
     "exchange in no cycle": (
         "board.upper.exchange={ below = { every = 3, phase = 3 } }",
-        "board.upper.exchange.below.phase = 3: must be less than every; permitted: 0 to 2 cycles",
+        "board.upper.exchange.below.phase = 3: must be less than every: 0 to 2 cycles",
     ),
     "rarely and at once": (
         "board.upper.exchange={ below = { every = 2, asynchronous = true } }",
         (
             "board.upper.exchange.below.every = 2: an asynchronous port is read in every cycle;"
-            " permitted: 1"
+            " must be 1"
         ),
     ),
-    "coupling": ("board.lower.coupling=none", 'permitted: "tight" or "loose" with a planner'),
-    "no planner": ("board.upper.coupling=tight", 'permitted: "none" without a planner'),
+    "coupling": ("board.lower.coupling=none", 'must be "tight" or "loose" with a planner'),
+    "no planner": ("board.upper.coupling=tight", 'must be "none" without a planner'),
     "loose": (
         "board.lower.coupling=loose",
         "board.lower.planner_slot: missing; a loosely coupled planner has",
@@ -89,7 +95,7 @@ MISTAKES = {
     "priorities": ("board.lower.planner_priority=5", "must be below the executor's priority, 0"),
     "polling": (
         "board.upper.wake=poll",
-        "needs a core of its own, but shares core 0 with: clock, lower, lower.planner",
+        "polling needs a core to itself; core 0 also runs clock, lower, lower.planner",
     ),
     "two ends": (
         "board.lower.ends_run=true",
@@ -144,7 +150,7 @@ def test_a_mistake_is_reported_alone_with_place_value_and_what_is_permitted(
     assert expected in str(mistake)
 
 
-def test_names_that_a_model_lacks_are_reported_together_with_those_it_has(write: Write) -> None:
+def test_names_missing_in_a_model_are_reported_with_the_existing_ones(write: Write) -> None:
     text = """
 extends = ["nasrem"]
 [robot]
@@ -174,7 +180,7 @@ def test_a_config_whose_boards_are_all_wrong_still_has_its_other_mistakes_report
     }
 
 
-def test_a_mistake_is_one_line_whatever_its_key_holds(write: Write) -> None:
+def test_a_mistake_is_one_line_whatever_its_key_contains(write: Write) -> None:
     with pytest.raises(ConfigError) as error:
         load(
             write(
@@ -190,14 +196,14 @@ def test_a_mistake_is_one_line_whatever_its_key_holds(write: Write) -> None:
 def test_a_segment_too_large_for_any_machine_is_refused(small: Path) -> None:
     with pytest.raises(
         ConfigError,
-        match=r"^mailbox upper.command: \d+ messages are kept .*; permitted: 1073741824; ",
+        match=r"^mailbox upper.command: \d+ messages are kept .*; at most 1073741824 are ",
     ):
         resolve(load(small, ["board.lower.rate_hz=0.001", "board.lower.within_cycles=10000"]))
 
 
 def test_a_phase_is_less_than_the_period(config: MakeConfig) -> None:
     assert resolve(config("board.watch.phase=7")).layout.task("watch").phase == 7
-    with pytest.raises(ConfigError, match="permitted: 0 to 7 ticks"):
+    with pytest.raises(ConfigError, match="period: 0 to 7 ticks"):
         resolve(config("board.watch.phase=8"))
 
 
@@ -210,14 +216,14 @@ def test_a_segment_may_have_its_largest_size(
     assert not [*levels.memory(layout)]
     monkeypatch.setattr(levels, "MAX_SEGMENT_BYTES", size - 1)
     (mistake,) = levels.memory(layout)
-    assert f"needs {size} bytes; permitted: {size - 1}" in mistake.why
+    assert f"needs {size} bytes; at most {size - 1} are possible" in mistake.why
 
 
 @pytest.mark.parametrize(
     ("setting", "place"),
     [("noise=[0, -1, 0, 0, 0, 0]", "noise[1]"), ("resolution=-1", "resolution")],
 )
-def test_a_value_of_several_possible_types_makes_one_mistake(setting: str, place: str) -> None:
+def test_an_invalid_value_of_a_union_is_one_mistake(setting: str, place: str) -> None:
     (mistake,) = mistakes("nasrem", f"robot.sensors.{setting}")
     assert (mistake.place, mistake.value) == (f"robot.sensors.{place}", -1)
 
@@ -249,18 +255,18 @@ STRICT = {
 
 
 @pytest.mark.parametrize(("setting", "place"), STRICT.values(), ids=STRICT)
-def test_what_depends_on_timing_is_refused_where_determinism_is_demanded(
+def test_settings_that_make_runs_depend_on_timing_are_refused_by_strict(
     small: Path, setting: str, place: str
 ) -> None:
     assert resolve(load(small, [setting]))
     (mistake,) = mistakes(small, setting, "protocol.strict=true")
-    why = "makes a run depend on timing, refused by protocol.strict = true; permitted: "
+    why = "makes a run depend on timing, which protocol.strict = true refuses; must be "
     assert str(mistake).startswith(f"{place}: {why}")
 
 
 def test_a_host_board_depends_on_timing() -> None:
     (mistake,) = [m for m in mistakes("penn", "protocol.strict=true") if m.place.startswith("host")]
-    assert str(mistake).endswith("strict = true; permitted: boards with a rate")
+    assert str(mistake).endswith("strict = true refuses; must be a board with a rate")
 
 
 PARAMS = {
@@ -305,7 +311,7 @@ def test_every_mistake_of_parameters_is_reported() -> None:
     ]
 
 
-def test_a_level_that_declares_no_parameters_reads_what_it_likes(small: Path) -> None:
+def test_a_level_that_declares_no_parameters_accepts_any(small: Path) -> None:
     assert resolve(load(small, ["board.lower.params={ gain = 'high', deep = { on = true } }"]))
 
 

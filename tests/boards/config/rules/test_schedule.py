@@ -10,7 +10,10 @@ from rack.boards.config.connections import Wiring
 from rack.boards.config.rules.boards import schedule
 from rack.boards.errors import ConfigError
 
-FIT = "does not fit the schedule, a multiple of the minor frame, 4 ms, that divides the major one,"
+FIT = (
+    "does not fit the schedule; it must be a multiple of the minor frame, 4 ms, that divides the"
+    " major frame,"
+)
 REFUSED = {
     "minor": (
         "schedule.minor_ms=4.5",
@@ -26,7 +29,10 @@ REFUSED = {
     ),
     "long": (
         "schedule.major_ms=40000",
-        "schedule.major_ms = 40000.0: 40000 ticks; permitted: up to 10000, 10000 ms",
+        (
+            "schedule.major_ms = 40000.0: 40000 ticks are too long; the longest major frame is"
+            " 10000 ticks, 10000 ms"
+        ),
     ),
     "no multiple": (
         "board.odd.every=6",

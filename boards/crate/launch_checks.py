@@ -1,0 +1,102 @@
+"""Checks of the machine's limits during a launch, and the notes that the launch reports."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from resource import RLIMIT_MEMLOCK, RLIMIT_NOFILE, getrlimit
+
+from rack.backplane.process import DEADLINE, cores_kept_awake, mapped_and_locked
+from rack.backplane.segment import Segment
+from rack.backplane.words import Block
+from rack.boards.config.layout import shared_out
+from rack.boards.config.resolved import Resolved
+from rack.boards.config.rules import network_rules
+from rack.boards.errors import LaunchError
+
+_PERMIT = (
+    "To allow it, add the line '@GROUP - {}' for one of your groups to /etc/security/limits.conf"
+    " and log in again (ulimit -{} shows the limit), or grant {}"
+)
+PERMIT = _PERMIT.format("rtprio 99", "r", "CAP_SYS_NICE")
+"""Advice on obtaining real-time priorities."""
+FILES = 32
+"""Files that a process of a rack may open, in addition to one for each process and mailbox."""
+
+
+def check_open_files(plan: Resolved) -> None:
+    """Raise `LaunchError` if the system permits too few open files for this rack."""
+    needed = FILES + len(plan.layout.processes) + len(plan.layout.mailboxes)
+    if 0 <= (allowed := getrlimit(RLIMIT_NOFILE)[0]) < needed:
+        raise LaunchError(
+            f"rack '{plan.config.name}': at most {allowed} open files are permitted (ulimit -n);"
+            f" the rack needs {needed}"
+        )
+
+
+def check_realtime(plan: Resolved, segment: Segment) -> None:
+    """Raise `LaunchError` if a real-time priority was refused and the config requires it."""
+    if plan.config.clock.on_no_realtime == "refuse" and (refusal := _find_refusal(plan, segment)):
+        raise LaunchError(f'{refusal}, and clock.on_no_realtime is "refuse". {PERMIT}')
+
+
+def list_launch_notes(plan: Resolved, segment: Segment) -> Iterator[str]:
+    """Yield what a launch reports: replaced cores, refused priorities and other limits."""
+    config = plan.config
+    yield from (*config.changed, *shared_out(config))
+    if (network := network_rules(config)) is not None:
+        yield from network.list_network_notes(config)
+    if config.is_lockstep:
+        yield from (
+            f"messages of {host.board} enter at ticks that depend on its timing; --entries RUN"
+            " repeats a run"
+            for host in plan.hosts
+            if host.is_external
+        )
+        return
+    if refusal := _find_refusal(plan, segment):
+        yield f"{refusal}; missed deadlines are likely. {PERMIT}"
+    yield from _list_reservations(plan, segment)
+    unlocked = {}
+    for task in plan.layout.tasks:
+        mapped, locked = mapped_and_locked(segment.block(task.name)[Block.PID])
+        if not locked:
+            unlocked[task.name] = mapped
+    if unlocked:
+        yield (
+            f"memory not locked for {', '.join(unlocked)}: the limit is"
+            f" {getrlimit(RLIMIT_MEMLOCK)[0]} bytes, a board maps {max(unlocked.values())};"
+            " page faults may delay cycles."
+            f" {_PERMIT.format('memlock unlimited', 'l', 'CAP_IPC_LOCK')}"
+        )
+    if config.clock.idle_cores == "awake":
+        with cores_kept_awake() as refusal:
+            yield f'clock.idle_cores = "awake": {refusal or "idle cores are held awake"}'
+
+
+def _find_refusal(plan: Resolved, segment: Segment) -> str:
+    """Return which tasks were refused their priority. Empty if none, or in lockstep."""
+    refused = [
+        task.name
+        for task in plan.layout.tasks
+        if task.priority and not segment.block(task.name)[Block.PRIORITY]
+    ]
+    if not refused or plan.config.is_lockstep:
+        return ""
+    return f"SCHED_FIFO refused, ordinary scheduling for {', '.join(refused)}"
+
+
+def _list_reservations(plan: Resolved, segment: Segment) -> Iterator[str]:
+    """Yield which tasks have a reservation, on which cores, and which were refused one."""
+    blocks = {
+        task.task: segment.block(task.task) for task in plan.tasks if task.reservation is not None
+    }
+    reserved = {name for name, block in blocks.items() if block[Block.PRIORITY] == DEADLINE}
+    pinned = {name for name in reserved if len(os.sched_getaffinity(blocks[name][Block.PID])) == 1}
+    for outcome, names in (
+        ("earliest deadline first by SCHED_DEADLINE, on their cores", pinned),
+        ("earliest deadline first by SCHED_DEADLINE, on any core", reserved - pinned),
+        ("SCHED_DEADLINE refused, fixed priorities", blocks.keys() - reserved),
+    ):
+        if names:
+            yield f"{outcome}: {', '.join(sorted(names))}"
