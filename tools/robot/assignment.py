@@ -29,8 +29,7 @@ from rack.levels.task.grasps import FULL_ORIENTATION, QUARTERS
 from rack.levels.task.program import DOWN, TaskConfig
 from rack.levels.task.rehearsal import Rehearsal
 from rack.tools.console.answer import Document
-from rack.tools.robot.draft import LEAST_PART, NOTHING, Draft, poses
-from rack.tools.robot.fingertips import Fingertips
+from rack.tools.robot.draft import LEAST_PART, NOTHING, Draft, FittedGripper, find_home, poses
 
 SEED = 1990
 """That of `nasrem`."""
@@ -83,19 +82,20 @@ def lay_out(made: Draft) -> Assignment:
     """Return what the arm can do, its home fit for that; the model gets table and blocks. Raises
     `RobotError`.
     """
-    if made.jaws is not None:
-        found = _pick_and_place(made, made.jaws)
+    if made.gripper is not None:
+        found = _pick_and_place(made, made.gripper)
         if isinstance(found, Assignment):
             return found
         made.notes.append(f"no transfer, but a tour of poses: {found}")
     return _tour(made)
 
 
-def _pick_and_place(made: Draft, jaws: Fingertips) -> Assignment | str:
+def _pick_and_place(made: Draft, gripper: FittedGripper) -> Assignment | str:
     cell = made.cell()
+    jaws = gripper.fingertips
     width = min(jaws.block, MOST_BLOCK_M)
     # The tool is in the middle of a block that stands, its fingers clear of the table.
-    clear = CLEAR_M + LOOSE_M * bool(made.table["gripper"].follow)
+    clear = CLEAR_M + LOOSE_M * bool(gripper.config.follow)
     half = 0.5 * np.array([width, width, max(width, 2.0 * (jaws.below + clear))])
     reach = _reach(cell)
     lift = round(min(0.1, 0.12 * reach), 3)
@@ -119,7 +119,7 @@ def _pick_and_place(made: Draft, jaws: Fingertips) -> Assignment | str:
         ]
         actions.append({"do": "home"})
         try:
-            made.search_home(scene, [np.array(action["to"]) for action in actions[:-1]])
+            made.home = find_home(made, scene, [np.array(action["to"]) for action in actions[:-1]])
             _rehearse(made, scene, actions)
             return Assignment(scene, actions, "a table, two blocks to move")
         except (Refused, RobotError) as refused:
@@ -127,7 +127,7 @@ def _pick_and_place(made: Draft, jaws: Fingertips) -> Assignment | str:
         for body in added:
             made.spec.delete(body)
         made.write_model()
-    made.search_home()
+    made.home = find_home(made)
     return why
 
 

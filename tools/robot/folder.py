@@ -31,7 +31,6 @@ def config_text(made: Draft, layout: Assignment, name: str, model: Path) -> str:
 
 def _lines(made: Draft, layout: Assignment, name: str) -> Iterator[str]:
     table: dict[str, Any] = {"guessed": list(made.guessed), **made.table, "model": f"{name}.xml"}
-    table = {key: value for key, value in table.items() if value is not None}
     inner = {key: value for key, value in table.items() if isinstance(value, Table)}
     yield from _keys({k: v for k, v in table.items() if k not in inner}, made.guessed)
     for key, value in inner.items():
@@ -42,8 +41,8 @@ def _lines(made: Draft, layout: Assignment, name: str) -> Iterator[str]:
         for one in follow:
             yield f"[[robot.{key}.follow]]"
             yield from _keys(one, {})
-    if made.bandwidth is not None:
-        yield f"\n[board.servo.params]\nbandwidth = {made.bandwidth:g}" + _comment(STIFF)
+    if made.limits.bandwidth is not None:
+        yield f"\n[board.servo.params]\nbandwidth = {made.limits.bandwidth:g}" + _comment(STIFF)
     yield "\n[scene]"
     yield from _keys({"objects": layout.scene.objects, "supports": layout.scene.supports}, {})
     yield f"\n[task]  # {layout.kind}"

@@ -51,7 +51,7 @@ def test_a_loop_is_stiff_enough_for_joints_to_rest_at_their_goals(
 ) -> None:
     model = with_friction(urdf(gripper=False)).replace(str(DRY_N_M), str(friction))
     made = draft(read_source(written(tmp_path, model)), Wishes(), tmp_path, "drafted")
-    assert made.bandwidth == bandwidth
+    assert made.limits.bandwidth == bandwidth
     text = config_text(made, Assignment(NOTHING, [], "nothing"), "drafted", made.model)
     assert tomllib.loads(text).get("board", {}) == (
         {"servo": {"params": {"bandwidth": bandwidth}}} if bandwidth else {}

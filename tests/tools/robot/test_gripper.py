@@ -46,11 +46,12 @@ def test_a_single_finger_closes_on_its_jaw_with_the_tool_next_to_that(tmp_path: 
     made = drafted(tmp_path, robot.model)
     gripper = gripper_of(made)
     assert (gripper.joint, gripper.open, gripper.closed) == ("finger_left", 0.04, -0.035)
-    assert made.jaws is not None
-    assert made.jaws.is_one
+    assert made.gripper is not None
+    fingertips = made.gripper.fingertips
+    assert fingertips.is_one
     # The jaw is at y = -35 mm of the hand, the finger opens 75 mm from it.
-    assert made.jaws.block == pytest.approx(0.35 * 0.075)
-    assert made.jaws.tool.position[1] == pytest.approx(-0.035 + 0.5 * made.jaws.block, abs=1e-4)
+    assert fingertips.block == pytest.approx(0.35 * 0.075)
+    assert fingertips.tool.position[1] == pytest.approx(-0.035 + 0.5 * fingertips.block, abs=1e-4)
     assert "finger and fixed jaw" in made.guessed["tool"]
 
 
