@@ -41,37 +41,41 @@ from rack.tools.robot.pieces import cut_meshes
 from rack.tools.robot.source import Source, copy_model
 
 CLOCK_NS = 2_500_000
-"""Of `nasrem`, whose levels and boards the arm gets."""
+"""Clock period of `nasrem`, whose levels and boards the arm gets."""
 SPEED = {mujoco.mjtJoint.mjJNT_HINGE: 1.5, mujoco.mjtJoint.mjJNT_SLIDE: 0.25}
-"""Guesses, rad/s and m/s."""
+"""Guessed velocity limits by joint type, rad/s and m/s."""
 SPEED_UP_S = 0.5
-"""Time to full speed of planned motion, where the motors can; jerk follows, ten times in a
-second."""
+"""Time to full speed of planned motion, if the motors permit.
+
+The jerk limit is ten times the acceleration limit.
+"""
 LEAST_PART = 0.2
-"""Part of each torque that gravity must leave at home."""
+"""Fraction of each torque limit that must be left over at home after gravity."""
 ROOM = 2.0
-"""A guessed torque in the weights and inertia that it moves."""
+"""Guessed torque limits, as a multiple of the torque for weight, friction and acceleration."""
 DRAG_PART = 0.4
-"""Of the torque that gravity leaves, for friction at a guessed velocity."""
+"""Fraction of the torque left over by gravity that friction may take at a guessed velocity."""
 REST_RAD = 0.002
-"""Where dry friction may hold a joint at rest, from where it should be; tasks permit 0.003."""
+"""Largest error at which dry friction may hold a joint at rest. Tasks permit 0.003 rad."""
 MOST_BANDWIDTH = 100.0
-"""Of the joint loop, rad/s."""
+"""Upper bound for the bandwidth of the joint loop, rad/s."""
 POSES = 400
+"""Number of poses that are sampled."""
 SKIN_M = 1e-4
-"""What is closer counts as in contact: planning would find no way there."""
+"""Bodies closer than this, m, count as touching, because the planner would reject such a pose."""
 APART_M = 0.005
-"""Home is rather where nothing is closer: a linkage settles a little off its equalities."""
+"""Preferred clearance at home, m, because a linkage settles slightly off its equalities."""
 ALWAYS = 0.95
-"""Bodies in contact in so many poses are neighbours, whose shapes overlap."""
+"""Bodies in contact in this fraction of the poses are neighbours whose shapes overlap."""
 TOOLS = ("tcp", "tool", "grip_site", "attachment", "eef", "ee_", "pinch", "hand", "flange")
-"""Parts of the names of frames at the end of an arm, the best first."""
+"""Name parts of frames at the end of an arm, in order of preference."""
 NOTHING = SceneConfig()
+"""A scene without objects or supports."""
 
 
 @dataclass(frozen=True)
 class Wishes:
-    """What the user says of an arm; empty: find it."""
+    """Options of the user. An empty one leaves the choice to the draft."""
 
     tip: str = ""
     joints: tuple[str, ...] = ()
@@ -222,7 +226,7 @@ def draft(source: Source, wanted: Wishes, folder: Path, name: str) -> Draft:
 
 
 def _draft(source: Source, wishes: Wishes, folder: Path, name: str) -> Draft:
-    """Take one step after the other. Each returns a record, computed from the draft so far."""
+    """Run the steps of a draft. Each returns a record that is computed from the draft so far."""
     model = source.compiled()
     arm = find_arm(model, wishes.tip, wishes.joints)
     # Equalities with joints that are fixed disappear with them, so check the couplings first.
@@ -367,7 +371,7 @@ def _find_overlaps(cell: Cell) -> tuple[tuple[str, str], ...]:
 
 
 def poses(cell: Cell) -> list[Array]:
-    """Return poses all over the joints' ranges, (joints,), rad."""
+    """Sample poses all over the joints' ranges, (joints,) each, rad."""
     low, high = sampling_range(cell)
     edge = 0.1 * (high - low)
     drawn = np.random.default_rng(0).uniform(low + edge, high - edge, (POSES, len(low)))
@@ -377,8 +381,16 @@ def poses(cell: Cell) -> list[Array]:
 def touching(
     cell: Cell, data: mujoco.MjData, q: Array, skin_m: float = SKIN_M
 ) -> set[tuple[str, str]]:
-    """Return the pairs of bodies in unintended contact at `q`, or closer than `skin_m`, if geoms
-    have that margin.
+    """Find pairs of bodies in unintended contact at a pose.
+
+    Args:
+        cell: The arm and its surroundings.
+        data: Simulation data of the cell. It is left at the pose.
+        q: Positions of the joints, (joints,), rad.
+        skin_m: Bodies closer than this, m, count as touching. The geoms need half of it as margin.
+
+    Returns:
+        Names of the bodies, sorted within each pair.
     """
     model = cell.model
     data.qpos[cell.qpos] = q

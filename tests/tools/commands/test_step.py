@@ -48,20 +48,20 @@ def test_a_held_rack_goes_on_by_cycles_and_ticks(
     tick, level = stepped(rack_name, "--until", "counter")
     assert (tick, level["row"]) == (41, "row 4 'turn', now in 'down', table saw")
     given = rack("command", rack_name, "counter", "table", "slow")
-    held_at = f"the rack is held before tick 41; 'rack step {rack_name}' lets it go on"
+    held_at = f"the rack is held before tick 41; 'rack step {rack_name}' continues it"
     assert given.stdout == f"command to 'counter', table slow: waits: {held_at}\n"
     tick, level = stepped(rack_name, "--cycles", "2", "--until", "counter")
     assert (tick, level["row"]) == (49, "row 4 'rest', now in 'resting', table slow")
     text = rack("step", rack_name, "--ticks", "1").stdout
     assert f"{rack_name}: held before tick 50, 0.125 s" in text
-    assert f"HELD: 'rack step {rack_name}' lets it go on" in rack("status", rack_name).stdout
+    assert f"HELD: 'rack step {rack_name}' continues it" in rack("status", rack_name).stdout
 
 
 @pytest.mark.slow
 def test_what_a_held_rack_is_asked_to_do_waits_and_is_done_when_it_goes_on(
     held: subprocess.Popen[bytes], rack_name: str
 ) -> None:
-    waits = f"waits: the rack is held before tick 0; 'rack step {rack_name}' lets it go on"
+    waits = f"waits: the rack is held before tick 0; 'rack step {rack_name}' continues it"
     for words, before in {
         ("command", rack_name, "counter", "table", "slow"): "command to 'counter', table slow: ",
         ("inject", rack_name, "watch", "mute"): "mute of watch: armed, ",

@@ -158,7 +158,7 @@ def test_nobody_stops_a_rack_who_may_not_or_has_no_key_to_press(far: Far) -> Non
         f"estop {far.address} --ready --reset": (2, f"--ready, --reset: {where}"),
         f"status {far.address}": (
             2,
-            f"RACK = {far.address}: this command works on the rack's own machine alone, as in:"
+            f"RACK = {far.address}: run this command on the rack's machine, as in:"
             " ssh HOST rack status; from another machine only: rack estop",
         ),
     }
@@ -238,7 +238,7 @@ def test_whoever_is_ready_is_told_when_the_run_ends(far: Far) -> None:
 def test_a_host_that_cannot_be_reached_is_one_line(tmp_path: Path) -> None:
     port = free_port()
     make_credentials(tmp_path / "certs", {"cell": []}, 1)
-    why = "not a rack; permitted: RACK, or HOST[:PORT]/RACK, as in 10.0.0.5/cell"
+    why = "must be RACK or HOST[:PORT]/RACK, as in 10.0.0.5/cell"
     with socket.create_server(("127.0.0.1", 0)) as server:
         open_port = server.getsockname()[1]
         ended = afar(
@@ -253,7 +253,7 @@ def test_a_host_that_cannot_be_reached_is_one_line(tmp_path: Path) -> None:
         f"127.0.0.1:{port}: cannot connect to port {port}: Connection refused",
         f'RACK = "127.0.0.1:99999/x": {why}',
         f'RACK = "127.0.0.1/X!": {why}',
-        ('--as = "X!": not a name; permitted: small letters, digits, "-" and "_", at most 40'),
+        '--as = "X!": must be at most 40 small letters, digits, "-" and "_"',
         missing,
     ]
 

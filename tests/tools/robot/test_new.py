@@ -88,7 +88,7 @@ def test_what_the_urdf_states_is_taken_and_the_rest_named_as_guessed(small: Path
     assert "\nhome = " in text
     assert "# guessed: free of contact" in text
     again = rack("robot", "new", small / "small.urdf", folder=small)
-    assert (again.returncode, "'small' is there already" in again.stderr) == (2, True)
+    assert (again.returncode, "'small' exists already" in again.stderr) == (2, True)
 
 
 @pytest.mark.slow
@@ -112,7 +112,7 @@ def test_a_name_that_rack_run_would_refuse_is_refused_with_one_that_serves(
 ) -> None:
     done = rack("robot", "new", DESK_ARM, f"--name={name}", "--out", "new", folder=tmp_path)
     assert (done.returncode, list(tmp_path.iterdir())) == (2, [])
-    assert done.stderr.startswith(f"--name = {name}: permitted")
+    assert done.stderr.startswith(f"--name = {name}: must be")
     assert done.stderr.endswith(f"; for example {better}\n")
 
 
