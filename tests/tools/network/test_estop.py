@@ -140,7 +140,7 @@ def test_nobody_stops_a_rack_who_may_not_or_has_no_key_to_press(far: Far) -> Non
     nobody = f"no rack '{far.name}' at {far.port}; racks there: none that knows 'nobody'; "
     where = "it waits to stop a rack of another machine, HOST/RACK"
     peer = f"{far.name}-peer"
-    reset = f"rack '{far.name}' resets an emergency stop on its own machine alone"
+    reset = f"rack '{far.name}' can only be reset on its own machine"
     refused = {
         f"estop {far.address} --as nobody": (
             1,
@@ -153,13 +153,13 @@ def test_nobody_stops_a_rack_who_may_not_or_has_no_key_to_press(far: Far) -> Non
             " adapter.lan.estop_from",
         ),
         f"estop {far.address} --reset": (1, f"{reset}: rack estop {far.name} --reset"),
-        f"estop {far.address} --ready": (1, "stdin has ended, and no stop was set"),
+        f"estop {far.address} --ready": (1, "stdin has ended before a stop was set"),
         f"estop {far.name} --ready": (2, f"--ready, {far.name}: {where}"),
         f"estop {far.address} --ready --reset": (2, f"--ready, --reset: {where}"),
         f"status {far.address}": (
             2,
             f"RACK = {far.address}: run this command on the rack's machine, as in:"
-            " ssh HOST rack status; from another machine only: rack estop",
+            " ssh HOST rack status; only 'rack estop' works from another machine",
         ),
     }
     ended = afar(*refused)
