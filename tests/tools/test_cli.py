@@ -47,7 +47,7 @@ def test_an_argument_without_end_is_refused_in_one_line(arguments: tuple[str, ..
     done = rack(*arguments)
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.startswith("argument ")
-    assert done.stderr.endswith(" characters; at most 4096\n")
+    assert done.stderr.endswith(" characters; must be at most 4096\n")
     assert len(done.stderr) < 200
 
 
@@ -162,9 +162,9 @@ def test_an_empty_name_is_no_rack_and_one_that_is_not_there_is_named(
 ) -> None:
     rest = {"command": ("upper", "hold"), "inject": ("wave", "kill")}.get(command, ())
     done = rack(command, "", *rest)
-    permitted = 'permitted: a running rack by name, as "rack list" shows it'
+    permitted = 'must be the name of a running rack, as "rack list" shows it'
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == f'RACK = "": empty; {permitted}\n'
+    assert done.stderr == f'RACK = "": {permitted}\n'
     done = rack(command, rack_name, *rest)
     assert (done.returncode, done.stdout) == (1, "")
     assert f"rack '{rack_name}' does not exist" in done.stderr

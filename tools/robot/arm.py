@@ -34,10 +34,7 @@ BASE_JOINTS = 3
 REFERRING = ("tendon", "equality", "actuator", "contact", "deformable", "sensor", "custom")
 """Sections of an MJCF file that refer to others."""
 KINDS = {"jointinparent": "joint", "node": "body", "subtree": "body", "target": "body"}
-"""Kind of element to which an attribute refers, where its name is not the kind's own.
-
-Numbers at the end of a name, as in `body1`, do not count.
-"""
+"""Kind of element that an attribute refers to, unless its name is the kind, as in `body1`."""
 KINDS |= {"xbody": "body", "refsite": "site", "sidesite": "site"}
 KINDS |= {"cranksite": "site", "slidersite": "site"}
 """To what an attribute refers, where its name, but for a number, is not that of the kind."""

@@ -186,9 +186,9 @@ class RewoundRun:
             settings: Changed values, as KEY=VALUE.
             faults: A fault script by name or path, or None.
             out: Folder of the branch. None for runs/<rack>-<time>.
-            seconds: Simulated time from the beginning of the recorded run. None for its duration if
+            seconds: Simulated time from the beginning of the recorded run. None for the duration of
                 that
-                was limited, otherwise until the task ends.
+                run if it was limited, otherwise until the task ends.
             display: Shows the branch while it runs.
 
         Raises:

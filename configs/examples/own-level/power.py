@@ -11,7 +11,7 @@ class PowerStatus(Status, version=1):
 
 
 class PowerMeter(Executor):
-    """What the arm takes, from torque and velocity."""
+    """Computes the power and energy that the arm takes, from torque and velocity."""
 
     servo = Input(ServoStatus, "servo.status")
     status = Output(PowerStatus)

@@ -147,12 +147,15 @@ def test_boards_killed_from_outside_are_found_and_come_back(small: Path, tmp_pat
     ("options", "line"),
     [
         (["--seconds", "9", "--kinds", "murder"], "--kinds murder: no such kind; kinds: kill, "),
-        (["--lockstep", "--realtime"], "--lockstep and --realtime: they exclude each other"),
+        (["--lockstep", "--realtime"], "--lockstep and --realtime exclude each other"),
         (
             ["--kills", "3", "--kinds", "kill"],
             "--kills 3 and --kinds kill: kills from outside are a kind of their own",
         ),
-        (["--set", "board.upper.ends_run=false"], "no board ends the run: give --seconds"),
+        (
+            ["--set", "board.upper.ends_run=false"],
+            "no board ends the run; give its simulated time with --seconds",
+        ),
         (["--set", "clock.wake=no"], 'clock.wake = "no": '),
     ],
 )

@@ -120,7 +120,9 @@ def test_budgets_come_from_an_earlier_run_and_are_in_a_fixed_config(
 def test_a_run_of_another_rack_is_refused_in_one_line(recorded: Path) -> None:
     done = check("fig2", "--from", recorded)
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == f"{recorded}: a run of other boards: lower, upper; 'fig2' has level\n"
+    assert (
+        done.stderr == f"{recorded}: its boards are lower, upper, but those of 'fig2' are level\n"
+    )
 
 
 @pytest.mark.slow

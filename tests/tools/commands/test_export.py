@@ -80,7 +80,7 @@ def test_what_cannot_be_exported_is_one_line(
 ) -> None:
     size = exported.stat().st_size
     for words, status, why in (
-        ((run,), 2, f"{exported}: exists; remove it, or give another --out"),
+        ((run,), 2, f"{exported}: exists already; remove it, or give another --out"),
         ((tmp_path,), 2, f"{tmp_path}: not a run: it has no config.toml"),
         ((run, "--out", "/dev/full/x"), 2, '"/dev/full/x.part": Not a directory'),
     ):

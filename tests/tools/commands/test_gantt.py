@@ -130,12 +130,12 @@ def test_figure_5_is_printed_and_drawn(tmp_path: Path) -> None:
         (["nosuch"], "no such file; by name: "),
         (["configs/tasks"], "configs/tasks: not a run: it has no config.toml"),
         (["crossing", "--set", "board.servo.slot=3"], "slot"),
-        (["fig2", "--figure", "3"], "--figure 3: permitted: 5"),
+        (["fig2", "--figure", "3"], "--figure 3: must be 5"),
         (
             ["fig2", "--process", "arm=3"],
             "--process arm: no board of that name has a budget; boards: level",
         ),
-        (["fig2", "--out", "README.md"], "--out README.md: no folder for pictures: File exists"),
+        (["fig2", "--out", "README.md"], "--out README.md: cannot create the folder: File exists"),
     ],
 )
 def test_bad_arguments_are_refused_in_one_line(words: list[str], message: str) -> None:

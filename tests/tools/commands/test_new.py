@@ -92,18 +92,18 @@ def test_a_new_level_reports_its_own_event_once_its_live_limit_is_set(
 @pytest.mark.parametrize(
     ("name", "why"),
     [
-        ("", "permitted: a-z, 0-9 and '_'"),
-        ("3d", "permitted: a-z, 0-9 and '_'"),
-        ("class", "permitted: a-z, 0-9 and '_'"),
-        ("a-b", "permitted: a-z, 0-9 and '_'"),
-        ("../up", "permitted: a-z, 0-9 and '_'"),
-        ("Upper", "permitted: a-z, 0-9 and '_'"),
-        ("a" * 41, "permitted: a-z, 0-9 and '_'"),
+        ("", "must be at most 40 of a-z, 0-9 and '_'"),
+        ("3d", "must be at most 40 of a-z, 0-9 and '_'"),
+        ("class", "must be at most 40 of a-z, 0-9 and '_'"),
+        ("a-b", "must be at most 40 of a-z, 0-9 and '_'"),
+        ("../up", "must be at most 40 of a-z, 0-9 and '_'"),
+        ("Upper", "must be at most 40 of a-z, 0-9 and '_'"),
+        ("a" * 41, "must be at most 40 of a-z, 0-9 and '_'"),
         ("json", "an installed module has that name"),
         ("nasrem", "a bundled config, or a board of nasrem, has that name"),
         ("servo", "a bundled config, or a board of nasrem, has that name"),
-        ("executor", "its class Executor would have the name of one that it uses"),
-        ("answering", "its class AnsweringStatus would have the name of one that it uses"),
+        ("executor", "its class would be named Executor, as a class that it uses"),
+        ("answering", "its class would be named AnsweringStatus, as a class that it uses"),
     ],
 )
 def test_a_name_that_cannot_be_is_refused_in_one_line(name: str, why: str, tmp_path: Path) -> None:
@@ -122,7 +122,7 @@ def test_what_is_there_stays_as_it_is(tmp_path: Path) -> None:
     for taken in ("mine", "file", "nowhere"):
         done = rack("new", "level", "mine", "--out", taken, folder=tmp_path)
         assert (done.returncode, done.stdout) == (2, "")
-        assert f"'{taken}' is there already" in done.stderr
+        assert f"'{taken}' exists already" in done.stderr
     assert [*(tmp_path / "mine").iterdir()] == [tmp_path / "mine" / "mine.py"]
     assert (tmp_path / "mine" / "mine.py").read_text() == "mine"
 

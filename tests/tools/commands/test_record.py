@@ -117,7 +117,7 @@ def test_a_rack_that_nothing_records_has_nothing_to_save(
     small: Path, rack_name: str, tmp_path: Path
 ) -> None:
     with Rack(load(small, [f"name={rack_name}"])):
-        with pytest.raises(Failure, match=f"--save {rack_name}: nothing records it"):
+        with pytest.raises(Failure, match=f"--save {rack_name}: the rack is not recorded"):
             record(rack_name, others=[], out=tmp_path / "saved", save=True)
         with pytest.raises(Failure, match="--save, --view: give one of them"):
             record(rack_name, others=[], out=None, view=True, save=True)
@@ -224,7 +224,7 @@ def test_replay_makes_a_file_only_where_none_is_and_only_of_runs(tmp_path: Path)
     made = out.read_bytes()
     for given, file, why in (
         (runs, out, "both.rrd: exists already"),
-        (runs, tmp_path / "both.png", "permitted: a name that ends in .rrd"),
+        (runs, tmp_path / "both.png", "the name of a file for the viewer must end in .rrd"),
         ([runs[0], out], tmp_path / "new.rrd", "both.rrd: not the folder of a run"),
         ([runs[0], tmp_path / "c"], tmp_path / "new.rrd", "c: no such folder"),
         ([runs[0], runs[0]], tmp_path / "new.rrd", "both are of rack 'a'"),

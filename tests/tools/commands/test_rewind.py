@@ -76,7 +76,7 @@ def test_any_tick_is_reached_and_its_messages_shown(run: Path, asked: Asked) -> 
     assert first["fields"]["value"] == found[2]["value"] == value[479]
     assert [one["tick"] for one in found[3:6]] == [481, 491, 488]
     assert found[6]["value"]["fields"]["value"] == value[487]
-    assert found[8]["error"].startswith("-0.0025: permitted: 0 to 1.9975 s")
+    assert found[8]["error"].startswith("-0.0025: must be 0 to 1.9975 s")
     assert "wave.status: no message yet at 0 s" in found[9]["error"]
     # Nothing is done after quit.
     assert len(found) == 10
@@ -164,12 +164,12 @@ def test_a_branch_differs_from_its_tick_on_and_an_unchanged_one_nowhere(
 def test_a_mistake_is_one_line_with_what_is_permitted(asked: Asked) -> None:
     lines = {
         "goot 3": "goot: no such command; nearest: goto",
-        "goto": 'goto: permitted: goto TIME, as in 12.5; or goto --when "',
-        "goto soon": "soon: permitted: 0 to 1.9975 s",
-        "goto nan": "nan: permitted: 0 to 1.9975 s",
-        "step x": "step: argument ticks: x: permitted: at most 1000000000000000 ticks, either way",
+        "goto": 'goto: usage: goto TIME, as in 12.5; or goto --when "',
+        "goto soon": "soon: must be 0 to 1.9975 s",
+        "goto nan": "nan: must be 0 to 1.9975 s",
+        "step x": "step: argument ticks: x: must be -1000000000000000 to 1000000000000000 ticks",
         f"step {DIGITS}": f"{DIGITS[:40]}",
-        f"back -{DIGITS}": "permitted: at most 1000000000000000 ticks, either way",
+        f"back -{DIGITS}": "must be -1000000000000000 to 1000000000000000 ticks",
         f"goto {DIGITS}": "permitted: 0 to 1.9975 s",
         f"goto -{DIGITS}": "permitted: 0 to 1.9975 s",
         f"events {DIGITS}": "permitted: 0 to 1e+09 s",
@@ -180,7 +180,7 @@ def test_a_mistake_is_one_line_with_what_is_permitted(asked: Asked) -> None:
         'goto --when "wave.status.valeu > 1"': "nearest: wave.status.value",
         "show wavf": "wavf: no such level, mailbox or signal; nearest: wave",
         "show wave.status.value[3]": "no such index",
-        "events -1": "-1: permitted: 0 to 1e+09 s",
+        "events -1": "-1: must be 0 to 1e+09 s",
         'show "wave': "No closing quotation",
         "help got": "got: no such command; nearest: goto",
     }

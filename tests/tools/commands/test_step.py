@@ -108,10 +108,10 @@ def test_a_held_rack_ends_with_its_launcher(held: subprocess.Popen[bytes], rack_
     [
         (
             ("--ticks", "1", "--until", "counter"),
-            "--ticks counts ticks, N, --cycles and --until count cycles",
+            "--ticks counts ticks, but N, --cycles and --until count cycles",
         ),
-        (("1", "--cycles", "1"), "N = 1: the same as --cycles; give one of them"),
-        (("--run", "--ticks", "1"), "--run lets the rack run on; leave out the steps"),
+        (("1", "--cycles", "1"), "N = 1: N and --cycles mean the same; give one of them"),
+        (("--run", "--ticks", "1"), "--run lets the rack run without holding; leave out the steps"),
     ],
 )
 def test_options_that_contradict_are_usage_errors(options: tuple[str, ...], reason: str) -> None:

@@ -52,8 +52,8 @@ def test_what_is_not_there_is_one_line(held: str, tmp_path: Path) -> None:
         ("mailbox", held, "--watch"): "--watch needs the NAME of a mailbox",
         ("watch", held, "counter.status.rwo"): "counter.status.rwo: no such signal; nearest: count",
         ("watch", held, "counter.status.row", "--out", "x.csv"): "--out needs --when; give both",
-        ("watch", held, "counter.status.row", "--every", "1"): "--every 1: not a time; permitted: ",
-        ("watch", held, "counter.status.row", "--after", "9e3s"): "--after 9e3s: not a time; permi",
+        ("watch", held, "counter.status.row", "--every", "1"): "--every 1: must be a time, ",
+        ("watch", held, "counter.status.row", "--after", "9e3s"): "--after 9e3s: must be a time, ",
         (*never, "--out", "missing/x.csv"): '"missing/x.csv": No such file or directory',
         (*never, "--out", "."): '".": Is a directory',
         ("watch", held, "counter.status.row", "--when", "counter.status.row > nan"): (

@@ -168,7 +168,7 @@ def test_a_run_that_continues_another_is_continued(run: Path, tmp_path: Path) ->
 def test_a_time_outside_the_run_is_refused(recorded: Path, tmp_path: Path, at: str) -> None:
     refused = rack("run", "--from", f"{recorded}@{at}", "--out", tmp_path / "two")
     assert (refused.returncode, refused.stderr.count("\n")) == (2, 1)
-    assert f"{at}: permitted: 0 to 1.9975 s" in refused.stderr
+    assert f"{at}: must be 0 to 1.9975 s" in refused.stderr
     assert not (tmp_path / "two").exists()
 
 
@@ -177,9 +177,9 @@ def test_a_time_outside_the_run_is_refused(recorded: Path, tmp_path: Path, at: s
     ("arguments", "why"),
     [
         (("--from", "runs/none@3"), "--from runs/none@3: runs/none is not a run"),
-        (("--from", "runs/none"), "permitted: RUN@TIME, as in runs/nasrem-1@12.5"),
-        (("nasrem", "--from", "runs/none@3"), "CONFIG, or --from RUN@TIME in its place"),
-        ((), "CONFIG, or --from RUN@TIME in its place"),
+        (("--from", "runs/none"), "must be RUN@TIME, as in runs/nasrem-1@12.5"),
+        (("nasrem", "--from", "runs/none@3"), "give either CONFIG or --from RUN@TIME"),
+        ((), "give either CONFIG or --from RUN@TIME"),
     ],
 )
 def test_what_is_no_run_is_refused(arguments: tuple[object, ...], why: str, tmp_path: Path) -> None:

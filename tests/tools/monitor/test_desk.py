@@ -186,7 +186,7 @@ def test_a_paused_rack_goes_on_from_there(running: str) -> None:
         tick = words[System.TICK]
         wait_until(lambda: words[System.TICK] > tick)
     done = rack("resume", running)
-    assert (done.returncode, done.stdout) == (0, f"rack '{running}' goes on\n")
+    assert (done.returncode, done.stdout) == (0, f"rack '{running}' continues\n")
     tick = words[System.TICK]
     wait_until(lambda: words[System.TICK] > tick)
     again = rack("resume", running)
@@ -204,7 +204,7 @@ def test_a_live_parameter_is_set_and_others_are_refused(running: str) -> None:
         f"{params}.bye=1": f"{params}.bye = 1: unknown key; did you mean 'by'?",
         f"{params}.label='x'": f'{params}.label = "x": read at the launch alone; live: by',
         f"{params}.by": 'name = "by": must be key=value, as in bandwidth=80',
-        "clock.speed=2": f"clock.speed=2: no level reads it while it runs; live: {params}.by",
+        "clock.speed=2": f"clock.speed=2: not a live parameter; valid keys: {params}.by",
     }.items():
         done = rack("set", running, setting)
         assert (done.returncode, done.stdout) == (2, "")
@@ -236,16 +236,16 @@ def test_a_parameter_set_on_a_held_rack_repeats_with_a_command_of_its_config(
 
 
 REFUSED = {
-    "upper resume --lease": "--lease: 'upper', resume: permitted: hold, ",
-    "upper hold --lease --wait": "--lease, --wait: a lease stays anyway",
+    "upper resume --lease": "--lease: 'upper', resume: must be one of hold, ",
+    "upper hold --lease --wait": "--lease and --wait: a lease waits anyway",
     "uper hold": 'level = "uper": no level of this name takes commands; levels that do: up',
     "upper hold --timeout 1": "--timeout needs --wait; give both, or neither",
     "upper": "LEVEL and WHAT are needed, as in: rack command ",
     "upper halt": "'enable', 'disable', 'reset' or 'release'",
     "lower setpoint joints=1": "'lower' does not take setpoint; it takes: hold, resume",
     "upper goto": "goal: missing; goto of 'upper' takes one of: home",
-    "upper goto hom": "'hom': not a goal; permitted: home, joints=..., position=...",
-    "upper goto joints=1,x": "'joints=1,x': 'x' is not a number; permitted: numbers separated by",
+    "upper goto hom": "'hom': not a goal; valid goals: home, joints=..., position=...",
+    "upper goto joints=1,x": "'joints=1,x': 'x' is not a number; numbers are separated by",
     "upper goto joints=1 joints=2": "'joints=2': joints is given twice",
     "upper hold --tick 0": "tick = 0: has passed; the rack is at tick ",
 }

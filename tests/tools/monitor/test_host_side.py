@@ -65,13 +65,13 @@ def test_a_run_with_a_host_board_is_continued_with_what_that_sent(
     done = rack("run", *asked.split(), "--out", tmp_path / "two", "--json")
     assert json.loads(done.stdout)["digest"] == first["digest"]
     assert done.stderr.splitlines() == [
-        f"{asked}: not started: 'program'; what they sent enters again",
+        f"{asked}: not started: 'program'; their recorded messages are replayed",
     ]
     two = Recording(tmp_path / "two")
     assert two.signal("bridge.numbers", "tick").min() >= tick
     refused = rack("run", *asked.split(), "--entries", run)
     assert (refused.returncode, refused.stderr.count("\n")) == (2, 1)
-    assert "a run that is continued has its own" in refused.stderr
+    assert "--from replays the entries anyway" in refused.stderr
 
 
 @pytest.mark.slow

@@ -24,9 +24,11 @@ def test_a_level_is_waited_for_by_its_cycles_and_not_for_ever(
         block[Block.CYCLES] = REPLY_CYCLES
         assert last.passed(100) == ""
         block[Block.CYCLES] += 1
-        assert last.passed(101) == f"has not answered in {REPLY_CYCLES} of its cycles"
+        assert last.passed(101) == f"has not answered within {REPLY_CYCLES} cycles"
         stopped = LastCycle(segment, layout.mailbox("lower.status"))
         assert stopped.passed(101) == stopped.passed(501) == ""
-        assert stopped.passed(502) == "has not answered, and done no cycle since tick 101"
+        assert (
+            stopped.passed(502) == "has not answered, and has not completed a cycle since tick 101"
+        )
     finally:
         unlink(rack_name)

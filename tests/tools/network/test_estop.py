@@ -138,7 +138,7 @@ def test_an_emergency_stop_is_set_from_afar_and_reset_at_the_rack(far: Far) -> N
 @pytest.mark.alone
 def test_nobody_stops_a_rack_who_may_not_or_has_no_key_to_press(far: Far) -> None:
     nobody = f"no rack '{far.name}' at {far.port}; racks there: none that knows 'nobody'; "
-    where = "it waits to stop a rack of another machine, HOST/RACK"
+    where = "--ready only stops a rack on another machine, HOST/RACK"
     peer = f"{far.name}-peer"
     reset = f"rack '{far.name}' can only be reset on its own machine"
     refused = {

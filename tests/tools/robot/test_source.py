@@ -106,7 +106,7 @@ def with_visuals(links: range) -> str:
 
 def test_what_is_only_visible_counts_in_planning_and_is_said(tmp_path: Path) -> None:
     source = read(tmp_path, with_visuals(range(3, 6)))
-    assert source.notes == ["no <collision>, so what is visible counts in planning: l3, l4, l5"]
+    assert source.notes == ["no <collision>, so planning uses the visible shapes: l3, l4, l5"]
     model = source.compiled()
     shown = [int(model.body(f"l{k}").geomnum[0]) for k in range(1, 7)]
     assert shown == [1] * 6
@@ -117,7 +117,7 @@ def test_links_without_inertia_are_named(tmp_path: Path) -> None:
     text = re.sub(r'(<link name="l[12]">)<inertial>.*?</inertial>', r"\1", MODEL, flags=re.DOTALL)
     notes = read(tmp_path, text).notes
     assert notes == [
-        "no <inertial>, so the mass is computed from the shapes, with the density of water: l1, l2"
+        "no <inertial>, so the mass is computed from the shapes with the density of water: l1, l2"
     ]
 
 
@@ -167,9 +167,9 @@ def test_a_planar_joint_below_the_base_is_held_and_said(tmp_path: Path) -> None:
     joint = '<joint name="drive" type="planar"><parent link="map"/><child link="base"/></joint>'
     source = read(tmp_path, MODEL.replace(TAIL, f'<link name="map"/>{joint}{TAIL}'))
     assert [one.name for one in source.spec.joints] == [f"j{k}" for k in range(1, 7)]
-    assert source.notes == ["held, as a mobile base stands: the planar joint 'drive'"]
+    assert source.notes == ["planar joint 'drive' is fixed: a mobile base does not move"]
 
 
 def test_a_model_in_millimetres_is_asked_about(tmp_path: Path) -> None:
     text = re.sub('xyz="0 0 (0.3)"', 'xyz="0 0 300"', MODEL)
-    assert read(tmp_path, text).notes == ["300 m from one part to the next: is it in mm?"]
+    assert read(tmp_path, text).notes == ["parts are 300 m apart: is the model in millimetres?"]

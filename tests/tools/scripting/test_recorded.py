@@ -60,7 +60,7 @@ def test_a_run_at_a_time_has_the_messages_that_are_read_there(small: Path) -> No
     assert {"lower.status", "upper.command", "lower.plan"} <= set(moment.mailboxes)
     with pytest.raises(rack.Failure, match=r"no message yet at 0 s"):
         rack.open_run(small).at(0).read("lower.status")
-    with pytest.raises(rack.Failure, match=r"^4\.1: permitted: 0 to 3\.9975 s$"):
+    with pytest.raises(rack.Failure, match=r"^4\.1: must be 0 to 3\.9975 s$"):
         rack.open_run(small).at(4.1)
 
 
@@ -129,7 +129,9 @@ def test_a_plot_has_units_names_and_marks(small: Path, tmp_path: Path) -> None:
     state = signals["lower.status.state"].plot(pyplot.figure().add_subplot())
     assert "executing" in [label.get_text() for label in state.get_yticklabels()]
     pyplot.close("all")
-    with pytest.raises(rack.Failure, match=r"^lower\.status\.reason: text; a plot needs numbers"):
+    with pytest.raises(
+        rack.Failure, match=r"^lower\.status\.reason: is a text; only numbers can be plotted"
+    ):
         signals["lower.status.reason"].plot()
 
 
