@@ -149,7 +149,7 @@ def _open_closed_streams() -> None:
     Otherwise the next file to be opened would get such a descriptor, and everything that is
     printed.
     """
-    # `os.open` returns the lowest free descriptor, which is that of the first closed stream.
+    # `os.open` returns the lowest free descriptor: the one that the first closed stream had.
     if sys.stdin is None:
         os.open(os.devnull, os.O_RDONLY)
         sys.stdin = ClosedInput()

@@ -1,5 +1,4 @@
-"""The command line before any command: arguments that none can use, paths that cannot be,
-completion by the shell."""
+"""Tests the command line before any command: unusable arguments and paths, shell completion."""
 
 from __future__ import annotations
 
@@ -79,7 +78,7 @@ def test_a_usage_error_of_any_command_is_a_document_under_json(command: str) -> 
 
 
 def outputs(small: Path, rack_name: str) -> list[tuple[str, ...]]:
-    """Return command lines that print, in each of the ways in which there are."""
+    """Return command lines that print, one for each way of printing."""
     run = ("run", str(small), "--set", f"name={rack_name}", "--seconds", "0.1", "--no-record")
     return [("list",), ("check", "fig2", "--json"), ("status", rack_name, "--json"), run]
 
@@ -195,7 +194,7 @@ def test_the_version_is_that_of_the_project() -> None:
 
 def test_bytes_that_are_no_text_are_refused() -> None:
     done = run_process([*RACK, "check", b"\xff"])
-    assert (done.returncode, done.stderr) == (2, 'argument 2 = "?": not UTF-8\n')
+    assert (done.returncode, done.stderr) == (2, 'argument 2 = "?": must be UTF-8\n')
 
 
 @pytest.mark.slow

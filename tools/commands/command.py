@@ -28,7 +28,7 @@ At = Annotated[
 def command(
     rack: RackName,
     level: str | None = argument(
-        "LEVEL", "task, elemental_move, primitive, servo, or a level of your own", None
+        "LEVEL", "task, elemental_move, primitive, servo, or your own level", None
     ),
     what: str | None = argument(
         "WHAT", "hold, resume, setpoint, goto, enable, ...; see above", None

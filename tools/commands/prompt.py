@@ -33,7 +33,7 @@ def prompt(
         "SCRIPT", "Python script to run, in place of a prompt", None, dir_okay=False
     ),
 ) -> None:
-    r"""Open a Python prompt on the host side of a running rack, or run a script there.
+    r"""Open a Python prompt, or run a script, on the host side of a running rack.
 
     The prompt runs as the program of a host board with `external = true`, one process at a time.
     `program` is the board's program, whose ports read and send messages. It may define more names.

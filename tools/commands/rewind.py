@@ -173,10 +173,11 @@ class RewindPrompt(cmd.Cmd):
     def do_show(self, line: str) -> None:
         """Show a message, one of its signals, or the object of a level at this tick.
 
-        The name is that of a mailbox, as in primitive.status, or primitive.plan for the plan; of a
-        signal,
-        as in servo.status.position[2]; or of a task, as in primitive or primitive.planner, for the
-        attributes of the level's object.
+        The name can be a mailbox, as in primitive.status, or primitive.plan for the plan; a signal,
+        as in
+        servo.status.position[2]; or a task, as in primitive or primitive.planner, for the
+        attributes of the
+        level's object.
         """
         self._answer(self._run.show(_given("show", line).name))
 

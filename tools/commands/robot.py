@@ -92,7 +92,7 @@ def check(
 ) -> None:
     r"""Examine an arm before it moves, and draw it.
 
-    The arm is that of a config, or the one that `rack robot new` would make of a model file. The
+    The arm belongs to a config, or is drafted from a model file as by `rack robot new`. The
     report shows axes, limits, reach, payload at the edge of the reach, contacts at home, unattached
     bodies, actuators by kind, the coupling of the gripper, its fingers, the natural frequency, and
     objects that fall without end.

@@ -278,10 +278,7 @@ def result_of(
 
 
 def _open_viewer(port: int) -> News:
-    """Open the viewer on the recorder and return its news.
-
-    A missing viewer is only reported there.
-    """
+    """Open the viewer on the recorder and return its news, which report a missing viewer."""
     window = import_module(VIEWER)
     try:
         opened: News = window.ViewerWindow(window.url(port)).news

@@ -25,7 +25,7 @@ STOP_S = 3.0
 
 @dataclass(frozen=True)
 class OtherEnd:
-    """How another rack has ended. `folder` is None if its run was not recorded."""
+    """The end of another rack. `folder` is None if its run was not recorded."""
 
     rack: str
     cause: str

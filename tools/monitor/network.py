@@ -78,7 +78,7 @@ class ExportRow:
 
 
 class Entries(NamedTuple):
-    """What a rack exchanges: sources of exports and imports by port, and its partner racks."""
+    """Exports and imports of a rack, with the source by port, and its partner racks."""
 
     exports: dict[str, str]
     imports: dict[str, str]

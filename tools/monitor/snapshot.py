@@ -212,7 +212,7 @@ class RackMonitor:
         warnings += [name for name, asserted in single.items() if asserted]
         words = self._segment.words
         tasks = [task.name for task in self._segment.layout.tasks if task.priority]
-        blocks = [(name, self._segment.block(name)) for name in tasks]
+        blocks = zip(tasks, map(self._segment.block, tasks), strict=True)
         refused = [name for name, block in blocks if block[Block.PID] and not block[Block.PRIORITY]]
         if refused and words[System.STATE] != Run.STARTING and not words[System.LOCKSTEP]:
             warnings.append(f"NO REAL-TIME PRIORITY: {', '.join(refused)}")

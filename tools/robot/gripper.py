@@ -139,9 +139,8 @@ def _finger(spec: mujoco.MjSpec, model: mujoco.MjModel, arm: ArmParts, name: str
     is_slide = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE
     lever = 1.0 if is_slide else max(LEAST_LEVER_M, norm(centre - data.xanchor[joint]))
     sideways = abs(inward) < SIDEWAYS * norm(motion) * norm(middle - centre)
-    if inward > 0.0:
-        return _Finger(low, high, lever, sideways)
-    return _Finger(high, low, lever, sideways)
+    ends = (low, high) if inward > 0.0 else (high, low)
+    return _Finger(*ends, lever, sideways)
 
 
 def _centre(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> Array:

@@ -206,8 +206,8 @@ class RewoundRun:
         difference = first_difference(self.recording, Recording(folder))
         where = "all messages that both runs wrote are equal"
         if difference is not None:
-            time_text = f"{self.time_s(difference.tick):g} s, tick {difference.tick}"
-            where = f"differs from {self.recording.folder} first at {time_text}, in {difference.mailbox}"
+            place = f"{self.time_s(difference.tick):g} s, tick {difference.tick}, in"
+            where = f"differs from {self.recording.folder} first at {place} {difference.mailbox}"
         document = {
             "folder": str(folder),
             "tick": self.tick,
@@ -218,7 +218,7 @@ class RewoundRun:
 
 
 def _flat(attributes: Mapping[str, Any], outer: str = "") -> Iterable[tuple[str, Any]]:
-    """Yield attributes with those of nested objects, by dotted names."""
+    """Yield attributes by dotted names, including the attributes of nested objects."""
     for name, value in attributes.items():
         if isinstance(value, dict):
             yield from _flat(value, f"{outer}{name}.")

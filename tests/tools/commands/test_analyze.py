@@ -1,4 +1,4 @@
-"""`rack analyze`: a run against the timing model, as a user sees it."""
+"""Tests `rack analyze`: a run compared with the timing model, as a user sees it."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ USUAL = ["--percentile", "50"]
 
 
 def verdicts(found: dict[str, Any], side: str) -> dict[tuple[str, str], bool]:
-    """Return which equations hold on which subjects, on one side of the document."""
+    """Return the verdict of each equation and subject, on one side of the document."""
     return {
         (row["equation"], row["subject"]): row[side]["holds"]
         for row in found["equations"]

@@ -1,4 +1,4 @@
-"""Campaigns on real racks: small ones, few faults; and what they must notice."""
+"""Tests small campaigns with few faults on real racks, and the mistakes that they must detect."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`rack check` as a user runs it: its tables, the changes that it proposes, and its exit status."""
+"""Tests `rack check` as a user runs it: tables, proposed changes and exit status."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ ALONE = ("--set", "board.lower.core=1", "--set", "board.lower.priority=80")
 
 @pytest.fixture(autouse=True)
 def two_cores() -> Iterator[None]:
-    """Let every machine have two cores: the cheapest change depends on them."""
+    """Pretend that the machine has two cores, because the cheapest change depends on them."""
     before = os.sched_getaffinity(0)
     os.sched_setaffinity(0, sorted(before)[:2])
     yield

@@ -1,8 +1,7 @@
-"""`rack check` of mutated configs: whatever they contain, it ends in time with exit status 0, 1 or
-2.
+"""Tests `rack check` with mutated configs: it always ends in time with exit status 0, 1 or 2.
 
-1 has one meaning: the config is valid, and its timing does not fit. Everything else is a mistake,
-one per line.
+Status 1 means only that the config is valid and its timing does not fit. Any other problem is a
+mistake, reported in one line.
 """
 
 from __future__ import annotations
@@ -48,8 +47,7 @@ PIECES = ("=", "[", "]]", '"', "1990-03-01", "0x", "\x7f", "\ufeff", "#", "\t", 
 
 @cache
 def texts() -> dict[str, dict[str, Any]]:
-    """Every shipped config, as written and resolved; tables that are not a whole rack extend one
-    that is."""
+    """Every shipped config, as written and resolved. Partial configs extend a complete one."""
     found = {
         str(path.relative_to(CONFIGS)): tomllib.loads(path.read_text())
         for path in sorted(CONFIGS.rglob("*.toml"))
@@ -63,7 +61,7 @@ def texts() -> dict[str, dict[str, Any]]:
 
 
 def places(node: Any) -> Iterator[tuple[Any, Any]]:
-    """Yield every value by what holds it and its key or number in there."""
+    """Yield every value with its container and its key or index."""
     keys = list(node) if isinstance(node, dict) else range(len(node))
     for key in keys:
         yield node, key
@@ -92,8 +90,7 @@ def spoil(tables: dict[str, Any], draw: random.Random) -> None:
 
 
 def torn(text: str, draw: random.Random) -> str:
-    """Return text that was edited without care: a line twice, a line less, the end lost, a stray
-    piece."""
+    """Return a text after careless editing: a line doubled, removed, cut off or inserted."""
     lines = text.splitlines()
     at = draw.randrange(len(lines))
     line, rest, piece = lines[at], lines[at + 1 :], draw.choice(PIECES)
@@ -105,7 +102,7 @@ def torn(text: str, draw: random.Random) -> str:
 
 
 def spoilt(draw: random.Random) -> str:
-    """Draw the text of a config with one to three changes."""
+    """Return the text of a config with one to three random changes."""
     tables = copy.deepcopy(texts()[draw.choice(sorted(texts()))])
     for _ in range(draw.randint(1, 3)):
         if tables:
@@ -116,7 +113,7 @@ def spoilt(draw: random.Random) -> str:
 
 @contextmanager
 def bounded() -> Iterator[None]:
-    """Let the body have so much processor time, and no more."""
+    """Limit the processor time of the body."""
 
     def end(signum: int, frame: object) -> None:
         raise TimeoutError(f"more than {BOUND_S} s of processor time")
@@ -135,7 +132,7 @@ def no_constant(name: str) -> float:
 
 
 def check(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, dict[str, Any]]:
-    """Return the status of `rack check --json`, in this process, and its answer."""
+    """Run `rack check --json` in this process, and return its exit status and answer."""
     capsys.readouterr()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", ["rack", "check", *arguments, "--json"])

@@ -1,4 +1,4 @@
-"""`rack export`: what is in the MCAP file is what was recorded, with units and meanings."""
+"""Tests `rack export`: the MCAP file contains the recording, with units and meanings."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`rack gantt` as a user runs it: text, pictures, JSON, and one line for what is refused."""
+"""Tests `rack gantt` as a user runs it: text, pictures, JSON, and refusals in one line."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.tools.recordings import cycle, recorded
 
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
-    """A run of fig2 that is exact to the millisecond, but for one late plan."""
+    """A run of fig2 that is exact to the millisecond, except for one late plan."""
     ms = (0, 0, 1, 3, 4)
     levels = [cycle(4 * n, 2000, *(1000 * (8 * n + at) for at in ms)) for n in range(20)]
     plans = []

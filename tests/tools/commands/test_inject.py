@@ -1,4 +1,4 @@
-"""`rack inject` and `rack estop` on a rack that runs, and what they refuse."""
+"""Tests `rack inject` and `rack estop` on a running rack, and their refusals."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ TASKS = "wave, wave.planner, watch, driven, clock"
 
 @pytest.fixture(scope="module")
 def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """The name of a rack in real time that runs until it is stopped."""
+    """Name of a real-time rack that runs until it is stopped."""
     path, name = tmp_path_factory.mktemp("rack") / "waves.toml", f"test-inject-{os.getpid()}"
     path.write_text(DRIVEN)
     command = [*RACK, "run", str(path), "--no-record", "--set", "clock.mode=realtime"]

@@ -1,4 +1,4 @@
-"""`rack new`: what it writes runs, and passes its test, as it is."""
+"""Tests `rack new`: the written files run, and pass their test, without changes."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ NUMBERS = count()
 
 @pytest.fixture
 def name() -> str:
-    """A name that no other module of this process has, nor a rack of another one."""
+    """A name that no module of this process and no other rack has."""
     return f"soft_touch_{os.getpid()}_{next(NUMBERS)}"
 
 
 @pytest.fixture
 def _without_templates(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Hide the templates, which other tests of this process may have made importable."""
+    """Hide the templates, which other tests in this process may have made importable."""
     own = [place for place in sys.path if not Path(place).is_relative_to(TEMPLATES)]
     monkeypatch.setattr(sys, "path", own)
     for kind in KINDS:

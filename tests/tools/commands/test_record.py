@@ -1,5 +1,4 @@
-"""`rack record` on a running rack; the viewer without a screen, `rack replay` without a
-recording."""
+"""Tests `rack record` on a running rack, and the viewer and `rack replay` when something is missing."""
 
 from __future__ import annotations
 
@@ -166,7 +165,7 @@ def test_racks_that_work_together_are_recorded_on_one_time_line(
 
 
 def kill_thread(pid: int, number: int) -> None:
-    """Send a signal to another thread than the first, as the kernel may do by itself."""
+    """Send a signal to a thread other than the first, as the kernel may do."""
     others = []
     for thread in Path(f"/proc/{pid}/task").iterdir():
         # A thread may end while they are listed.

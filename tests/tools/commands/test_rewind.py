@@ -1,4 +1,4 @@
-"""`rack rewind`: any tick of a run again, forwards, backwards, by a condition, and branches."""
+"""Tests `rack rewind`: going to any tick, forwards, backwards or by a condition, and branches."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class Asked:
-    """Asks `rack rewind --json` for lines; `status` is that of the last time."""
+    """Sends lines to `rack rewind --json`. `status` is the exit status of the last call."""
 
     def __init__(self, run: Path, patch: pytest.MonkeyPatch) -> None:
         self._run = run
@@ -58,7 +58,7 @@ class Asked:
 
 @pytest.fixture
 def asked(run: Path, monkeypatch: pytest.MonkeyPatch) -> Asked:
-    """Ask for lines on the run."""
+    """Sends lines to a prompt on the run."""
     return Asked(run, monkeypatch)
 
 
@@ -136,7 +136,7 @@ def test_a_tick_that_was_reached_is_where_later_ones_go_on_from(
 
 
 def continued_from(events: Sequence[Event]) -> int:
-    """Return the tick of the snapshot from which a rack went on; -1: none."""
+    """Return the tick of the snapshot from which a rack continued, or -1 without one."""
     return next((event.tick for event in events if event.code == CONTINUES), -1)
 
 
@@ -170,10 +170,10 @@ def test_a_mistake_is_one_line_with_what_is_permitted(asked: Asked) -> None:
         "step x": "step: argument ticks: x: must be -1000000000000000 to 1000000000000000 ticks",
         f"step {DIGITS}": f"{DIGITS[:40]}",
         f"back -{DIGITS}": "must be -1000000000000000 to 1000000000000000 ticks",
-        f"goto {DIGITS}": "permitted: 0 to 1.9975 s",
-        f"goto -{DIGITS}": "permitted: 0 to 1.9975 s",
-        f"events {DIGITS}": "permitted: 0 to 1e+09 s",
-        f"branch --seconds {DIGITS}": "permitted: 0 to 1e+09 s",
+        f"goto {DIGITS}": "must be 0 to 1.9975 s",
+        f"goto -{DIGITS}": "must be 0 to 1.9975 s",
+        f"events {DIGITS}": "must be 0 to 1e+09 s",
+        f"branch --seconds {DIGITS}": "must be 0 to 1e+09 s",
         f"branch --set seed={DIGITS}": "integer too long; permitted: 64 bits",
         f"show wave.status.value[{DIGITS}]": "no such signal; nearest: wave.status.value",
         f"show wave.status.value[{12 * DIGITS}]": "wave.status.value[9",
@@ -188,7 +188,7 @@ def test_a_mistake_is_one_line_with_what_is_permitted(asked: Asked) -> None:
     assert [why in one["error"] for why, one in zip(lines.values(), found, strict=False)] == [
         True
     ] * len(lines), found
-    assert "begun to hold" in found[-1]["help"]
+    assert "begins to hold" in found[-1]["help"]
     assert len(found) == len(lines) + 1
     assert asked.status == 2
     asked("goto 1", "events 2")

@@ -1,4 +1,4 @@
-"""The verdict on a run is one: in the exit status, the first line, the files and the documents."""
+"""Tests that exit status, first line, files and documents of a run have the same verdict."""
 
 from __future__ import annotations
 

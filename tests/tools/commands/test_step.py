@@ -1,5 +1,4 @@
-"""`rack step`: a rack in lockstep holds between ticks, goes on by cycles, and ends when it is
-stopped meanwhile."""
+"""Tests `rack step`: holding a rack in lockstep between ticks, stepping it, and stopping it."""
 
 from __future__ import annotations
 
@@ -23,13 +22,13 @@ from tests.tools.held_racks import held_rack
 
 @pytest.fixture
 def held(rack_name: str, tmp_path: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """The launcher of a rack that counts, held before tick 0."""
+    """Launcher of a counting rack, held before tick 0."""
     with held_rack(tmp_path, rack_name) as (process, _):
         yield process
 
 
 def stepped(name: str, *options: str) -> tuple[int, dict[str, str]]:
-    """Step a rack; return the tick before which it holds, and the row of its counter."""
+    """Step a rack, and return the tick before which it holds and the row of its counter."""
     done = rack("step", name, *options, "--json")
     assert done.returncode == 0, done.stderr
     answer = json.loads(done.stdout)
@@ -85,7 +84,7 @@ def test_what_a_held_rack_is_asked_to_do_waits_and_is_done_when_it_goes_on(
 def test_a_rack_let_go_runs_is_held_again_and_ends_in_order(
     held: subprocess.Popen[bytes], rack_name: str
 ) -> None:
-    assert rack("step", rack_name, "--run").stdout == f"rack '{rack_name}' runs on\n"
+    assert rack("step", rack_name, "--run").stdout == f"rack '{rack_name}' runs without holding\n"
     words = Segment.attach(rack_name).words
     wait_until(lambda: words[System.TICK] > 100 and not words[System.HELD])
     first, _ = stepped(rack_name, "--ticks", "1")

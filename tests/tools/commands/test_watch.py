@@ -1,4 +1,4 @@
-"""`rack watch` and `rack mailbox`, on racks that run: what they show is what was written."""
+"""Tests `rack watch` and `rack mailbox` on running racks: they show what was written."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.tools.held_racks import held_rack
 
 @pytest.fixture
 def held(rack_name: str, tmp_path: Path) -> Iterator[str]:
-    """The name of a rack that counts, held before tick 20."""
+    """Name of a counting rack, held before tick 20."""
     with held_rack(tmp_path, rack_name):
         assert rack("step", rack_name, "--ticks", "20").returncode == 0
         yield rack_name
@@ -134,8 +134,7 @@ def test_a_moment_that_does_not_come_or_fit_is_said(
 
 
 def go_on(name: str, until: str, ticks: int = 8000) -> None:
-    """Step a rack by 8 ticks until this text was printed, for so many ticks at most; end its
-    run."""
+    """Step a rack by 8 ticks until a text is printed, up to a number of ticks, then end its run."""
     stepper = Stepper(Segment.attach(name))
     tick = stepper.hold()
     for step in range(0, ticks, 8):

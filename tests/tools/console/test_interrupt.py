@@ -1,5 +1,4 @@
-"""SIGINT, SIGTERM and SIGHUP at any moment of a run: the exit status says which, and nothing is
-left."""
+"""Tests SIGINT, SIGTERM and SIGHUP at any moment of a run: exit status, and nothing left behind."""
 
 from __future__ import annotations
 

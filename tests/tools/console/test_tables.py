@@ -1,4 +1,4 @@
-"""Tables: they fit the terminal, and in a pipe nothing is cut or coloured."""
+"""Tests that tables fit the terminal, and are neither cut nor coloured in a pipe."""
 
 from __future__ import annotations
 

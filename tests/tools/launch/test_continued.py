@@ -1,5 +1,4 @@
-"""`rack run --from RUN@TIME`: what continues or is repeated, and what is refused, writing
-nothing."""
+"""Tests `rack run --from RUN@TIME`: continued and repeated runs, and refusals that write nothing."""
 
 from __future__ import annotations
 
@@ -118,7 +117,7 @@ def test_a_run_in_an_outage_has_no_state_and_the_time_is_refused(
     whole = rack("run", small, "--lockstep", *names, *common)
     refused = rack("run", "--from", f"{one}@1.2", "--no-record", *common)
     assert (refused.returncode, refused.stderr.count("\n")) == (2, 1), refused.stderr
-    assert "1.2: a board is lost then" in refused.stderr
+    assert "1.2: a board is lost at this time" in refused.stderr
     # Back, and restarted, it goes on; the loss counts.
     later = rack("run", "--from", f"{one}@1.8", "--no-record", *common)
     assert json.loads(later.stdout)["digest"] == json.loads(whole.stdout)["digest"]

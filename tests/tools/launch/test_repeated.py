@@ -1,5 +1,4 @@
-"""A run, in real time too, is repeated in lockstep with what its operators
-commanded."""
+"""Tests that a run, also one in real time, is repeated in lockstep with its operators' commands."""
 
 from __future__ import annotations
 
@@ -32,7 +31,7 @@ HOLD = "level = 'upper', what = 'hold', tick = 40"
 
 
 class Commanding(Display):
-    """An operator who commands a running rack when it is seen to have reached a tick."""
+    """An operator who commands a running rack when it reaches certain ticks."""
 
     period_s = 0.02
 
@@ -48,7 +47,7 @@ class Commanding(Display):
 
 
 class ByHand(Display):
-    """An operator, waiting or under a lease, at a rack that is held before each command's tick."""
+    """An operator at a rack that is held before the tick of each command."""
 
     period_s = 0.01
 
@@ -94,8 +93,10 @@ def requests(config: RackConfig, **ticks: int) -> tuple[Request, ...]:
 
 
 def commanded(folder: Path, name: str, mode: str) -> Recording:
-    """Return a run of 2 s in which an operator commands what no config has: in lockstep at given
-    ticks, in real time whenever it comes."""
+    """Return a run of 2 s in which an operator gives commands that are not in the config.
+
+    In lockstep they are given at fixed ticks, in real time at any tick.
+    """
     file = folder / "commanded.toml"
     file.write_text(COMMANDED)
     settings = (f"name={name}", f"clock.mode={mode}", commands(HOLD))
@@ -110,7 +111,7 @@ def commanded(folder: Path, name: str, mode: str) -> Recording:
 
 
 def repeated(one: Recording, folder: Path, at: float = 0.0) -> Recording:
-    """Return the run that goes on from it."""
+    """Return the run that continues another run."""
     arguments = ("--from", f"{one.folder}@{at}", "--seconds", SECONDS, "--out", folder, "--json")
     done = rack("run", *arguments)
     assert not done.stderr
@@ -132,7 +133,7 @@ def test_what_an_operator_commanded_before_the_config_did_is_not_taken_for_that(
 
 @pytest.fixture(scope="module")
 def in_lockstep(tmp_path_factory: pytest.TempPathFactory) -> Recording:
-    """A run in lockstep whose operator commands what no config has."""
+    """A lockstep run whose operator gives commands that are not in the config."""
     return commanded(
         tmp_path_factory.mktemp("lockstep"), f"test-repeated-{os.getpid()}", "lockstep"
     )
@@ -179,8 +180,7 @@ def test_a_run_in_real_time_is_repeated_equal_up_to_its_first_miss(
 
 @pytest.fixture(scope="module", params=[Client.WAITS, Client.LEASES])
 def by_hand(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Recording:
-    """A run in lockstep whose operator commands at 140 and 260
-    what no config has; under a lease these are in force to the end."""
+    """A lockstep run whose operator gives such commands at ticks 140 and 260, or leases them."""
     folder = tmp_path_factory.mktemp("by-hand")
     (folder / "commanded.toml").write_text(COMMANDED)
     name = f"test-by-hand-{os.getpid()}"
@@ -195,7 +195,7 @@ def by_hand(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
 
 
 def continued(one: Recording, at: float, folder: Path, *settings: str) -> Recording:
-    """Return the run that goes on from it, with nothing to note."""
+    """Return the run that continues another run without a note."""
     options = [option for setting in settings for option in ("--set", setting)]
     names = ("--from", f"{one.folder}@{at}", "--seconds", SECONDS, "--out", folder, "--json")
     done = rack("run", *names, *options)

@@ -1,4 +1,4 @@
-"""`rack command` on running racks: giving a command, waiting for the reply, and refusals."""
+"""Tests `rack command` on running racks: giving a command, waiting for the reply, and refusals."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.tools.command_line import BOUND_S, ROOT, rack
 
 
 def start(path: Path, name: str, *settings: str) -> subprocess.Popen[str]:
-    """Start a rack that runs until it is stopped; return when it does."""
+    """Start a rack that runs until it is stopped, and return when it runs."""
     path.write_text(COMMANDED.replace("commanded_levels:Lower", "commanded_levels:Homing"))
     given = [word for setting in (f"name={name}", *settings) for word in ("--set", setting)]
     command = [*RACK, "run", str(path), "--no-record", *given]
@@ -45,7 +45,7 @@ def end(process: subprocess.Popen[str], name: str) -> None:
 def running(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[str]:
-    """The name of a rack that runs until it is stopped."""
+    """Name of a rack that runs until it is stopped."""
     name = f"test-command-{request.param}-{os.getpid()}"
     process = start(
         tmp_path_factory.mktemp("rack") / "told.toml", name, f"clock.mode={request.param}"
@@ -90,8 +90,7 @@ def test_waiting_is_for_the_end_of_a_command_which_says_how_to_end_it(running: s
 
 @contextmanager
 def waiting(name: str) -> Iterator[tuple[subprocess.Popen[str], int]]:
-    """A process that waits for the end of its command, whose serial is given, too: until the level
-    counts by nine."""
+    """A process that waits for the end of its command, and the serial of the command."""
     words = Segment.attach(name).words
     given = words[System.COMMANDED]
     command = [*RACK, "command", name, "lower", "goto", "home", "--wait", "--json"]

@@ -1,4 +1,4 @@
-"""Views of a running rack: the table, and the line for where there is no terminal."""
+"""Tests the views of a running rack: the table, and the line without a terminal."""
 
 from __future__ import annotations
 

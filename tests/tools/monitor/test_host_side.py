@@ -1,5 +1,4 @@
-"""The host side on the command line: a prompt, what status and check show, and replays of recorded
-entries."""
+"""Tests the host side on the command line: prompt, status, check, and replayed entries."""
 
 from __future__ import annotations
 
@@ -23,7 +22,7 @@ from tests.tools.command_line import rack
 
 @pytest.fixture
 def hosted(tmp_path: Path) -> Path:
-    """A rack with a host board, as a file."""
+    """A config file of a rack with a host board."""
     path = tmp_path / "hosted.toml"
     path.write_text(HOSTED)
     return path

@@ -1,5 +1,4 @@
-"""Interrupts as users see them: in `rack status`, in the report of a run, and message by
-message."""
+"""Tests interrupts in `rack status`, in the report of a run, and message by message."""
 
 from __future__ import annotations
 
@@ -19,8 +18,7 @@ from tests.tools.recordings import recorded as write_recording
 
 
 def recorded(folder: Path, name: str, *settings: str) -> Recording:
-    """Run the rack of tests of interrupts, and return its recording, without waiting for a recorder
-    to start."""
+    """Run the rack for these tests, and return its recording without starting a recorder process."""
     path = folder / "hub.toml"
     path.write_text(RACK)
     config = load(path, [f"name={name}", *settings])

@@ -1,4 +1,4 @@
-"""Queues as users see them: in `rack status`, in the report of a run, in `rack check`."""
+"""Tests queues in `rack status`, in the report of a run, and in `rack check`."""
 
 from __future__ import annotations
 

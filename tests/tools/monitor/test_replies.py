@@ -1,4 +1,4 @@
-"""The wait for the reply of a level to its operator's command."""
+"""Tests the wait for a level's reply to an operator's command."""
 
 from __future__ import annotations
 

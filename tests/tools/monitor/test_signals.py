@@ -1,5 +1,4 @@
-"""Signals as they are written: none is missed, and those of several mailboxes are merged by
-tick."""
+"""Tests that no message of a signal is missed, and that signals are merged by tick."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""A look at a rack's memory: who is lost, who was restarted, what is demanded, which faults are
-active."""
+"""Tests snapshots of a rack's memory: lost and restarted boards, demands, active faults."""
 
 from __future__ import annotations
 
@@ -35,7 +34,7 @@ def segment(small: Path, rack_name: str) -> Iterator[Segment]:
 
 
 class Seen(Display):
-    """Keeps the states that `upper` was shown with."""
+    """Stores the states in which `upper` was shown."""
 
     period_s = 0.01
 

@@ -1,4 +1,4 @@
-"""Which joints of a model are the arm's, which are passive, and what is done with the rest."""
+"""Tests which joints of a model form the arm, which are passive, and what happens to the rest."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SPRING = 'stiffness="20" damping=".2"'
 
 
 def rod(name: str, inner: str = "", spring: str = SPRING) -> str:
-    """Return a light body on a hinge named so."""
+    """Return a light body on a hinge with this name."""
     return (
         f'<body name="{name} body" pos="0 0 .06"><joint name="{name}" axis="1 0 0" {spring}/>'
         f'<geom type="capsule" size=".008" fromto="0 0 .012 0 0 .04" mass=".01"/>{inner}</body>'

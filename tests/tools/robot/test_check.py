@@ -1,4 +1,4 @@
-"""`rack robot check`: what is wrong with an arm is seen before it moves."""
+"""Tests `rack robot check`: problems of an arm are found before it moves."""
 
 from __future__ import annotations
 

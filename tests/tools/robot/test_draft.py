@@ -1,4 +1,4 @@
-"""What `rack robot new` makes of an arm's joints."""
+"""Tests the limits and loops that `rack robot new` chooses for an arm's joints."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What `rack robot new` makes of grippers: one drive, and what follows it."""
+"""Tests the grippers that `rack robot new` drafts: one drive and its followers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whatever refers to bodies of a model that are left out is left out as well."""
+"""Tests that elements which refer to removed bodies of a model are removed as well."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ KEPT = (
 
 
 def held(folder: Path, inside: str = "", outside: str = "") -> mujoco.MjModel:
-    """Return a model of which all but its arm was held."""
+    """Return a model in which everything except its arm was fixed."""
     text = MODEL.format(inside=inside, outside=outside)
     spec = load_spec(written(folder, text, "given.xml"))
     spec.compile()

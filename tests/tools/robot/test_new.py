@@ -1,4 +1,4 @@
-"""`rack robot new`: from a model file to an arm that moves, with nothing edited."""
+"""Tests `rack robot new`: from a model file to an arm that moves, without editing."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ LEVER = link("lever", "0.01 0.01 0.01", "0 0 0") + joint(
 
 
 def follows(leader: str) -> str:
-    """Return an arm of which the third joint mimics another one."""
+    """Return an arm whose third joint mimics another one."""
     third = '<joint name="j3" type="revolute">'
     return urdf().replace(third, f'{third}<mimic joint="{leader}"/>')
 

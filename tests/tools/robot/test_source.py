@@ -1,4 +1,4 @@
-"""URDFs as they are found: what is read, what is said of it, and what is refused in one line."""
+"""Tests reading of URDFs: what is accepted, what is noted, and refusals in one line."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def test_what_is_missing_from_a_urdf_is_said_with_what_to_do(tmp_path: Path, cas
 
 
 def with_visuals(links: range) -> str:
-    """Return an arm, some links of which have no shape but a visual."""
+    """Return an arm in which some links have only a visual shape."""
     text = MODEL
     for k in links:
         start, end = text.index(f'<link name="l{k}">'), text.index(f'<joint name="j{k}"')

@@ -1,4 +1,4 @@
-"""A rack that runs in the background of a program, and what attaches to it reads and commands."""
+"""Tests reading and commanding a rack that runs in the background of a program."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_what_goes_wrong_is_the_line_of_the_command(own: Rack, live: AttachedRac
         "lower.statsu: no such mailbox; nearest: lower": lambda: live.read("lower.statsu"),
         "detection: not within 0 s$": lambda: live.wait_for("detection", 0.0),
         "< 0: not within 0 s$": lambda: live.wait_until("lower.status.count < 0", 0.0),
-        "by=2: no level reads it while it runs": lambda: live.set("board.upper.params.by", 2),
+        "by=2: not a live parameter": lambda: live.set("board.upper.params.by", 2),
         '^kind = "kil"': lambda: live.inject("lower", "kil"),
         "^rack 'no-such-rack' does not exist": lambda: rack.attach("no-such-rack"),
     }

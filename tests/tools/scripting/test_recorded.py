@@ -1,4 +1,4 @@
-"""A run read back by a program: signals, tables, events and report."""
+"""Tests reading a run from a program: signals, tables, events and report."""
 
 from __future__ import annotations
 
