@@ -1,4 +1,4 @@
-"""Runs the `rack` command line inside the test process, which saves a second of imports per call."""
+"""Runs the `rack` command line inside the test process, which saves a second of imports."""
 
 from __future__ import annotations
 

@@ -90,7 +90,7 @@ def test_a_fixed_config_loads_and_holds(small: Path, tmp_path: Path) -> None:
     assert again.stdout == config.text()
 
 
-def test_where_nothing_helps_no_config_is_printed(small: Path) -> None:
+def test_no_config_is_printed_if_no_change_helps(small: Path) -> None:
     done = check(small, "--set", "board.lower.budget.process_ms=100", "--fix")
     assert (done.returncode, done.stdout) == (1, "")
     assert done.stderr.startswith("no change helps with 3.1 of lower")
@@ -143,7 +143,7 @@ def test_a_static_schedule_is_a_table_of_its_distinct_frames() -> None:
 
 
 @pytest.mark.slow
-def test_verbose_shows_what_the_arm_does_while_no_torque_comes() -> None:
+def test_verbose_shows_the_motion_of_the_arm_without_new_torques() -> None:
     words = ("nasrem", "--set", "robot.patience_ms=10")
     (line,) = (line for line in check(*words).stdout.splitlines() if line.startswith("patience: "))
     assert "'servo' goes on with its last torque for 10 ms (4 cycles; permitted: 10.0 ms)" in line

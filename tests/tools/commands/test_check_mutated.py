@@ -154,7 +154,7 @@ def judge(status: int, document: dict[str, Any]) -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)  # a machine that is shared: the bound is processor time
-def test_a_spoilt_config_is_answered_in_time_with_what_is_wrong(
+def test_a_mutated_config_gets_an_answer_in_time(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path, seen = tmp_path / "spoilt.toml", set()
@@ -182,7 +182,7 @@ ATTACKS = {
 
 
 @pytest.mark.parametrize(("rack", "setting", "place"), ATTACKS.values(), ids=ATTACKS)
-def test_what_made_rack_check_hang_or_fall_is_a_mistake_on_one_line(
+def test_configs_that_once_hung_or_crashed_the_check_are_mistakes(
     capsys: pytest.CaptureFixture[str], rack: str, setting: str, place: str
 ) -> None:
     status, document = check(capsys, rack, "--set", setting)
@@ -190,7 +190,7 @@ def test_what_made_rack_check_hang_or_fall_is_a_mistake_on_one_line(
     assert [line.startswith(f"{place} ") for line in document["error"]] == [True]
 
 
-def test_the_longest_cycles_and_plans_there_are_are_judged_in_time(
+def test_the_longest_possible_cycles_and_plans_are_judged_in_time(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     settings = ("clock.period_ms=0.01", "timing.clock_ms=0.009999", "board.level.every=1000000")

@@ -219,7 +219,7 @@ def test_ctrl_c_ends_a_run_in_order(small: Path, rack_name: str, tmp_path: Path)
 
 
 @pytest.mark.slow
-def test_what_a_killed_launcher_leaves_is_cleaned(
+def test_leftovers_of_a_killed_launcher_are_cleaned(
     running: subprocess.Popen[str], rack_name: str
 ) -> None:
     running.kill()

@@ -30,7 +30,7 @@ def exported(run: Path) -> Path:
     return run / "run.mcap"
 
 
-def test_every_message_is_there_as_it_was_written(run: Path, exported: Path) -> None:
+def test_every_message_is_exported_as_it_was_written(run: Path, exported: Path) -> None:
     recording = Recording(run)
     clock_ns = recording.layout.clock_ns
     ticks: dict[str, list[int]] = {}
@@ -75,7 +75,7 @@ def test_schemas_have_units_and_meanings(run: Path, exported: Path) -> None:
     assert schemas["lower.status"]["state"]["type"] == "string"
 
 
-def test_what_cannot_be_exported_is_one_line(
+def test_a_refused_export_is_reported_in_one_line(
     run: Path, exported: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     size = exported.stat().st_size

@@ -145,7 +145,7 @@ def test_bad_arguments_are_refused_in_one_line(words: list[str], message: str) -
     assert len(shown.stderr.splitlines()) == 1
 
 
-def test_a_run_cannot_be_asked_for_what_it_does_not_have(run: Path) -> None:
+def test_a_window_outside_the_run_is_refused(run: Path) -> None:
     assert (
         "outside the run, which lasts from 0 to 160 ms"
         in rack("gantt", run, "--from-ms", 500).stderr

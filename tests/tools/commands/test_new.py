@@ -57,7 +57,7 @@ def test_it_writes_a_class_a_config_and_a_test_with_the_users_name(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
-def test_what_it_writes_runs_and_passes_its_test(kind: str, name: str, tmp_path: Path) -> None:
+def test_the_written_files_run_and_pass_their_test(kind: str, name: str, tmp_path: Path) -> None:
     done = rack("new", kind, name, folder=tmp_path)
     assert f"next: rack run {name}/{name}.toml --lockstep --seconds 2; pytest {name}" in done.stdout
     run = [*("run", f"{name}/{name}.toml", "--lockstep", "--seconds", "2", "--no-record")]
@@ -106,7 +106,7 @@ def test_a_new_level_reports_its_own_event_once_its_live_limit_is_set(
         ("answering", "its class would be named AnsweringStatus, as a class that it uses"),
     ],
 )
-def test_a_name_that_cannot_be_is_refused_in_one_line(name: str, why: str, tmp_path: Path) -> None:
+def test_an_unusable_name_is_refused_in_one_line(name: str, why: str, tmp_path: Path) -> None:
     done = rack("new", "level", name, folder=tmp_path)
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.startswith(f'NAME = "{name}": {why}')
@@ -114,7 +114,7 @@ def test_a_name_that_cannot_be_is_refused_in_one_line(name: str, why: str, tmp_p
     assert not [*tmp_path.iterdir()]
 
 
-def test_what_is_there_stays_as_it_is(tmp_path: Path) -> None:
+def test_an_existing_folder_is_not_changed(tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "mine.py").write_text("mine")
     (tmp_path / "file").write_text("mine")

@@ -83,9 +83,7 @@ def test_any_tick_is_reached_and_its_messages_shown(run: Path, asked: Asked) -> 
     assert asked.status == 2
 
 
-def test_a_condition_leads_to_where_it_begins_to_hold_forwards_and_backwards(
-    run: Path, asked: Asked
-) -> None:
+def test_a_condition_is_found_forwards_and_backwards(run: Path, asked: Asked) -> None:
     ticks, value = (Recording(run).signal("wave.status", name) for name in ("tick", "value"))
     limit = float(value[300]) + 1.0
     held = value > limit
@@ -108,7 +106,7 @@ def test_a_level_is_shown_as_it_was_at_that_tick(asked: Asked) -> None:
     assert found[5]["value"]["_recent"] == [tick % 7 for tick in range(115, 120)]
 
 
-def test_a_tick_that_was_reached_is_where_later_ones_go_on_from(
+def test_later_ticks_continue_from_the_nearest_reached_tick(
     run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     begun: list[int] = []
@@ -140,7 +138,7 @@ def continued_from(events: Sequence[Event]) -> int:
     return next((event.tick for event in events if event.code == CONTINUES), -1)
 
 
-def test_a_branch_differs_from_its_tick_on_and_an_unchanged_one_nowhere(
+def test_a_branch_differs_only_after_its_tick_and_only_if_changed(
     run: Path, asked: Asked, tmp_path: Path
 ) -> None:
     before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
@@ -161,7 +159,7 @@ def test_a_branch_differs_from_its_tick_on_and_an_unchanged_one_nowhere(
     assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
 
 
-def test_a_mistake_is_one_line_with_what_is_permitted(asked: Asked) -> None:
+def test_a_mistake_is_reported_in_one_line_with_the_usage(asked: Asked) -> None:
     lines = {
         "goot 3": "goot: no such command; nearest: goto",
         "goto": 'goto: usage: goto TIME, as in 12.5; or goto --when "',

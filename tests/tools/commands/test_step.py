@@ -36,7 +36,7 @@ def stepped(name: str, *options: str) -> tuple[int, dict[str, str]]:
 
 
 @pytest.mark.slow
-def test_a_held_rack_goes_on_by_cycles_and_ticks(
+def test_a_held_rack_is_stepped_by_cycles_and_ticks(
     held: subprocess.Popen[bytes], rack_name: str
 ) -> None:
     assert [stepped(rack_name)[0] for _ in range(3)] == [1, 9, 17]
@@ -57,7 +57,7 @@ def test_a_held_rack_goes_on_by_cycles_and_ticks(
 
 
 @pytest.mark.slow
-def test_what_a_held_rack_is_asked_to_do_waits_and_is_done_when_it_goes_on(
+def test_requests_to_a_held_rack_wait_until_it_continues(
     held: subprocess.Popen[bytes], rack_name: str
 ) -> None:
     waits = f"waits: the rack is held before tick 0; 'rack step {rack_name}' continues it"
@@ -81,7 +81,7 @@ def test_what_a_held_rack_is_asked_to_do_waits_and_is_done_when_it_goes_on(
 
 
 @pytest.mark.slow
-def test_a_rack_let_go_runs_is_held_again_and_ends_in_order(
+def test_a_released_rack_can_be_held_again_and_ends_in_order(
     held: subprocess.Popen[bytes], rack_name: str
 ) -> None:
     assert rack("step", rack_name, "--run").stdout == f"rack '{rack_name}' runs without holding\n"

@@ -45,7 +45,7 @@ def test_mailboxes_are_listed_and_their_newest_messages_shown(held: str) -> None
 
 
 @pytest.mark.slow
-def test_what_is_not_there_is_one_line(held: str, tmp_path: Path) -> None:
+def test_an_unknown_name_is_reported_in_one_line(held: str, tmp_path: Path) -> None:
     never = ("watch", held, "counter.status.row", "--when", "counter.status.row > 99")
     cases = {
         ("mailbox", held, "counter.stat"): "counter.stat: no such mailbox; nearest: coun",
@@ -89,7 +89,7 @@ def test_every_message_is_shown_until_the_run_ends(
 
 
 @pytest.mark.slow
-def test_a_moment_is_saved_with_what_was_around_it(held: str, tmp_path: Path) -> None:
+def test_a_window_around_a_trigger_is_saved(held: str, tmp_path: Path) -> None:
     signals = ("counter.status.fired", "watch.status.state")
     condition = "counter.status.row == 4"
     with in_thread(lambda: go_on(held, '"rows"')):
@@ -125,7 +125,7 @@ def test_a_moment_is_saved_with_what_was_around_it(held: str, tmp_path: Path) ->
     ],
     ids=["full disk", "never"],
 )
-def test_a_moment_that_does_not_come_or_fit_is_said(
+def test_a_trigger_that_fails_or_does_not_fit_is_reported(
     held: str, words: tuple[str, ...], until: str, said: str
 ) -> None:
     with in_thread(lambda: go_on(held, until, ticks=80)):
@@ -147,7 +147,7 @@ def go_on(name: str, until: str, ticks: int = 8000) -> None:
     Segment.attach(name).words[System.STOP_REQUEST] = 1
 
 
-def test_a_time_is_one_of_all_units() -> None:
+def test_times_are_accepted_in_all_units() -> None:
     assert [watch._seconds("--every", text) for text in ("20ms", "0.5s", "2 min")] == [
         0.02,
         0.5,

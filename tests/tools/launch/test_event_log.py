@@ -22,9 +22,7 @@ def codes(path: Path) -> list[str]:
 
 
 @pytest.mark.parametrize("is_ended", [True, False])
-def test_a_log_has_events_as_they_become_known_and_at_the_end_by_tick(
-    tmp_path: Path, is_ended: bool
-) -> None:
+def test_a_log_is_sorted_by_tick_at_the_end(tmp_path: Path, is_ended: bool) -> None:
     path = tmp_path / "events.jsonl"
     log = EventLog(Display())
     log.open(path)

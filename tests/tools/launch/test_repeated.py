@@ -120,7 +120,7 @@ def repeated(one: Recording, folder: Path, at: float = 0.0) -> Recording:
 
 
 @pytest.mark.slow
-def test_what_an_operator_commanded_before_the_config_did_is_not_taken_for_that(
+def test_an_operators_command_is_not_mistaken_for_one_of_the_config(
     rack_name: str, tmp_path: Path
 ) -> None:
     file = tmp_path / "commanded.toml"
@@ -141,7 +141,7 @@ def in_lockstep(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("at", "ticks"), [(0.0, [40, 80, 200]), (0.3, [200]), (1.2025, [])])
-def test_a_run_in_lockstep_goes_on_from_any_tick_with_its_operators_commands(
+def test_a_lockstep_run_continues_from_any_tick_with_its_operators_commands(
     in_lockstep: Recording, tmp_path: Path, at: float, ticks: list[int]
 ) -> None:
     two = repeated(in_lockstep, tmp_path / "two", at)
@@ -151,7 +151,9 @@ def test_a_run_in_lockstep_goes_on_from_any_tick_with_its_operators_commands(
 
 
 @pytest.mark.slow
-def test_the_commands_are_what_makes_it_equal(in_lockstep: Recording, tmp_path: Path) -> None:
+def test_a_repeated_run_without_the_commands_differs(
+    in_lockstep: Recording, tmp_path: Path
+) -> None:
     # The run's config has no command but the first one.
     again = load(in_lockstep.folder / "config.toml", [])
     assert [command.tick for command in again.command] == [40]
@@ -207,7 +209,7 @@ def continued(one: Recording, at: float, folder: Path, *settings: str) -> Record
 @pytest.mark.parametrize(
     ("at", "ticks"), [(0.25, [140, 260]), (0.3, [140, 260]), (0.4, [260]), (0.6, [260]), (0.7, [])]
 )
-def test_what_operators_commanded_later_is_repeated(
+def test_later_commands_of_operators_are_repeated(
     by_hand: Recording, tmp_path: Path, at: float, ticks: list[int]
 ) -> None:
     two = continued(by_hand, at, tmp_path / "two")
@@ -229,7 +231,7 @@ def test_a_command_that_waits_in_a_snapshot_is_issued_once(
 
 
 @pytest.mark.slow
-def test_a_branch_has_its_own_commands_besides_those_repeated(
+def test_a_branch_adds_its_commands_to_the_repeated_ones(
     by_hand: Recording, tmp_path: Path
 ) -> None:
     earlier = "level = 'upper', what = 'hold', tick = 200"
@@ -238,7 +240,7 @@ def test_a_branch_has_its_own_commands_besides_those_repeated(
 
 
 @pytest.mark.slow
-def test_of_a_flight_recorder_commands_are_repeated_to_the_end_of_a_stretch(
+def test_commands_in_a_flight_recorder_are_repeated_to_the_end_of_a_stretch(
     by_hand: Recording,
 ) -> None:
     flight = Recording(by_hand.folder)
@@ -248,7 +250,7 @@ def test_of_a_flight_recorder_commands_are_repeated_to_the_end_of_a_stretch(
 
 
 @pytest.mark.slow
-def test_levels_that_write_the_name_of_their_rack_write_that_of_the_run(
+def test_a_repeated_rack_writes_the_name_of_the_original_rack(
     rack_name: str, tmp_path: Path
 ) -> None:
     # A servo level that waits to be enabled says by which command, with the rack's name.

@@ -71,7 +71,7 @@ def test_a_command_is_given_and_taken_up(running: str) -> None:
 
 
 @pytest.mark.slow
-def test_waiting_is_for_the_end_of_a_command_which_says_how_to_end_it(running: str) -> None:
+def test_waiting_lasts_until_the_command_is_done_and_tells_how_to_end_it(running: str) -> None:
     answer = json.loads(rack("command", running, "upper", "hold", "--wait", "--json").stdout)
     assert answer["fate"] == "done"
     # The level below has answered: two cycles later.
@@ -103,7 +103,7 @@ def waiting(name: str) -> Iterator[tuple[subprocess.Popen[str], int]]:
 
 
 @pytest.mark.slow
-def test_a_wait_goes_on_while_another_operator_sets_something(running: str) -> None:
+def test_a_wait_continues_while_another_operator_sets_a_parameter(running: str) -> None:
     with waiting(running) as (process, serial):
         assert rack("set", running, "board.lower.params.by=2").returncode == 0
         assert rack("command", running, "lower", "modify", "twice", "off").returncode == 0
@@ -116,7 +116,7 @@ def test_a_wait_goes_on_while_another_operator_sets_something(running: str) -> N
 
 
 @pytest.mark.slow
-def test_a_wait_ends_when_another_command_takes_its_place(running: str) -> None:
+def test_a_wait_ends_when_another_command_supersedes_its_command(running: str) -> None:
     with waiting(running) as (process, serial):
         assert rack("command", running, "lower", "resume").returncode == 0
         answer = json.loads(process.communicate(timeout=BOUND_S)[0])
@@ -125,7 +125,7 @@ def test_a_wait_ends_when_another_command_takes_its_place(running: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("gone", [signal.SIGKILL, signal.SIGSTOP])
-def test_a_level_holds_whose_operator_has_gone_within_a_lease(
+def test_a_level_holds_when_the_operator_of_a_lease_has_gone(
     running: str, gone: signal.Signals
 ) -> None:
     segment = Segment.attach(running)
@@ -154,7 +154,7 @@ def test_a_level_holds_whose_operator_has_gone_within_a_lease(
 
 
 @pytest.mark.slow
-def test_a_lease_ends_when_another_command_takes_its_place(running: str) -> None:
+def test_a_lease_ends_when_another_command_supersedes_it(running: str) -> None:
     segment = Segment.attach(running)
     upper = [*RACK, "command", running, "upper", "hold", "--lease"]
     with subprocess.Popen(upper, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
@@ -170,7 +170,7 @@ def test_a_lease_ends_when_another_command_takes_its_place(running: str) -> None
 
 
 @pytest.mark.slow
-def test_a_paused_rack_goes_on_from_there(running: str) -> None:
+def test_a_paused_rack_continues_from_its_tick(running: str) -> None:
     words = Segment.attach(running).words
     done = rack("pause", running, "--json")
     paused = json.loads(done.stdout)

@@ -53,7 +53,7 @@ def test_a_replay_of_recorded_entries_repeats_the_run_without_host_boards(
 
 
 @pytest.mark.slow
-def test_a_run_with_a_host_board_is_continued_with_what_that_sent(
+def test_a_run_with_a_host_board_is_continued_with_its_messages(
     tmp_path: Path, recorded: tuple[Path, dict[str, Any]]
 ) -> None:
     run, first = recorded

@@ -11,9 +11,7 @@ from rack.tools.monitor.replies import REPLY_CYCLES, LastCycle
 from tests.boards.commanded_racks import COMMANDED
 
 
-def test_a_level_is_waited_for_by_its_cycles_and_not_for_ever(
-    tmp_path: Path, rack_name: str
-) -> None:
+def test_the_wait_for_a_level_is_bounded_by_its_cycles(tmp_path: Path, rack_name: str) -> None:
     (tmp_path / "told.toml").write_text(COMMANDED)
     layout = resolve(load(tmp_path / "told.toml", [f"name={rack_name}"])).layout
     segment = Segment.create(layout, "")

@@ -89,7 +89,7 @@ def test_the_arm_ends_at_its_last_driven_joint(
     assert (arm.joints, arm.fingers, arm.passive) == (joints, fingers, passive)
 
 
-def test_joints_that_are_named_are_driven(tmp_path: Path) -> None:
+def test_named_joints_are_driven(tmp_path: Path) -> None:
     arm = found(tmp_path, FLEXIBLE, joints=(*JOINTS, "flex1"))
     assert arm.joints == (*JOINTS, "flex1")
     assert arm.passive == ("flex2",)
@@ -99,14 +99,14 @@ def test_joints_that_are_named_are_driven(tmp_path: Path) -> None:
     ("text", "tip", "names"),
     [(without_motor("elbow"), "", "elbow"), (FLEXIBLE, "flex2 body", "flex1, flex2")],
 )
-def test_a_passive_joint_within_the_arm_is_refused_with_what_to_do(
+def test_a_passive_joint_within_the_arm_is_refused_with_advice(
     tmp_path: Path, text: str, tip: str, names: str
 ) -> None:
     with pytest.raises(RobotError, match=rf"nothing drives {names}, .* --tip .* --joints"):
         found(tmp_path, text, tip)
 
 
-def test_an_arm_of_too_many_joints_is_refused_with_what_to_do(tmp_path: Path) -> None:
+def test_an_arm_with_too_many_joints_is_refused_with_advice(tmp_path: Path) -> None:
     inner = ""
     for number in range(12, 0, -1):
         inner = rod(f"snake{number}", inner, spring='range="-1 1"')
@@ -161,7 +161,7 @@ LIMITS = 'lower="-2.8" upper="2.8"'
 
 @pytest.mark.slow
 @pytest.mark.parametrize("limits", ['lower="0" upper="0"', "", 'lower="2" upper="-2"'])
-def test_a_range_that_is_none_is_said_and_mujoco_prints_nothing(
+def test_an_invalid_range_is_reported_and_mujoco_prints_nothing(
     tmp_path: Path, limits: str, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -174,7 +174,7 @@ def test_a_range_that_is_none_is_said_and_mujoco_prints_nothing(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("effort", ["inf", "1e12"])
-def test_an_effort_without_bound_is_none_and_torques_are_guessed(
+def test_an_infinite_effort_counts_as_unstated_and_torques_are_guessed(
     tmp_path: Path, effort: str
 ) -> None:
     text = urdf(gripper=False).replace('effort="60.0"', f'effort="{effort}"')

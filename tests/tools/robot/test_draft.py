@@ -27,7 +27,7 @@ def with_friction(text: str) -> str:
 
 
 @pytest.mark.slow
-def test_dry_friction_of_light_links_is_what_the_equation_of_motion_says(tmp_path: Path) -> None:
+def test_dry_friction_of_light_links_follows_the_equation_of_motion(tmp_path: Path) -> None:
     source = read_source(written(tmp_path, with_friction(urdf(gripper=False))))
     made = draft(source, Wishes(), tmp_path, "drafted")
     assert "dry friction acts within 1 ms" in made.notes

@@ -26,7 +26,7 @@ def gripper_of(made: Draft) -> GripperConfig:
     return made.robot.gripper
 
 
-def test_a_finger_that_nothing_couples_follows_and_that_is_a_guess(tmp_path: Path) -> None:
+def test_an_uncoupled_finger_follows_as_a_guess(tmp_path: Path) -> None:
     made = drafted(tmp_path, written(tmp_path, urdf(mimics=False)))
     assert gripper_of(made).follow == (FollowConfig(joint="right_finger", ratio=1.0),)
     assert "right_finger follow" in made.guessed["gripper"]
@@ -55,7 +55,7 @@ def test_a_single_finger_closes_on_its_jaw_with_the_tool_next_to_that(tmp_path: 
     assert "finger and fixed jaw" in made.guessed["tool"]
 
 
-def test_a_finger_that_meets_nothing_is_held_and_the_reason_said(tmp_path: Path) -> None:
+def test_a_finger_that_meets_nothing_is_fixed_with_a_note(tmp_path: Path) -> None:
     robot, _ = grippers.one_finger(tmp_path)
     model = tmp_path / "puma560.xml"
     model.write_text(model.read_text().replace(grippers.FIXED, ""))
@@ -65,7 +65,7 @@ def test_a_finger_that_meets_nothing_is_held_and_the_reason_said(tmp_path: Path)
     assert [joint.name for joint in made.spec.joints] == list(made.robot.joints)
 
 
-def test_a_gripper_that_its_own_arm_keeps_from_closing_is_held(tmp_path: Path) -> None:
+def test_a_gripper_that_its_arm_blocks_is_fixed(tmp_path: Path) -> None:
     robot, _ = grippers.soft(tmp_path)
     model = tmp_path / "puma560.xml"
     # Of the link before the last: MuJoCo lets fingers and the hand that carries them overlap.

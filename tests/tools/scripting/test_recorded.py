@@ -49,7 +49,7 @@ def test_a_signal_is_an_array_with_its_ticks_and_unit(
     assert len(levels) == len(run.signals["task.status.state"].ticks)
 
 
-def test_a_run_at_a_time_has_the_messages_that_are_read_there(small: Path) -> None:
+def test_a_run_at_a_time_has_the_messages_that_tasks_read_then(small: Path) -> None:
     moment = rack.open_run(small).at(1.2)
     assert (moment.tick, moment.time_s) == (480, 1.2)
     status = rack.open_run(small).signals["lower.status.count"]
@@ -89,7 +89,7 @@ def test_events_and_report_are_those_of_the_run(small: Path) -> None:
     assert (small / "report.json").is_file()
 
 
-def test_runs_and_signals_say_what_they_are(small: Path) -> None:
+def test_runs_and_signals_describe_themselves(small: Path) -> None:
     run = rack.open_run(small)
     name = run._recording.layout.rack
     ends = f"time over, {len(run.signals)} signals>"
