@@ -19,7 +19,16 @@ STEP = 0.002  # m: distance between two checks of the force
 
 
 def expect(request, end, what):
-    """Wait for a request, and raise an error unless it ended with `end`."""
+    """Wait for a request, and check how it ended.
+
+    Args:
+        request: The request.
+        end: The expected end.
+        what: Name of the step, for the error.
+
+    Raises:
+        RuntimeError: The request ended differently.
+    """
     wait(request)
     if end_of(request) is not end:
         raise RuntimeError(f"{what}: {end_of(request).name.lower()}, not {end.name.lower()}")
@@ -28,7 +37,14 @@ def expect(request, end, what):
 def wipe(y, seconds, end, what):
     """Press while moving along the surface to y.
 
-    Raises an error if the force was wrong on more than a fifth of the way.
+    Args:
+        y: Goal, m.
+        seconds: Duration of the motion.
+        end: The expected end.
+        what: Name of the step, for the error.
+
+    Raises:
+        RuntimeError: The force was wrong on more than a fifth of the way, or the end differs.
     """
     pressed = {}
 

@@ -92,7 +92,7 @@ def mailbox(
     rounds: int = option("--rounds N", "turns of every contestant", 200, min=1),
     as_json: Json = False,
 ) -> None:
-    """What does a message cost, next to iceoryx2, HORUS and pipes?
+    """Measure the cost of a message, next to iceoryx2, HORUS and pipes.
 
     Messages of 64 B to 16 kB are sent to one reader and to four, by every protocol, alternately
     with iceoryx2, HORUS and pipes of multiprocessing. The ratio is to the best of these peers.
@@ -110,7 +110,7 @@ def cycle(
     share: Share = False,
     as_json: Json = False,
 ) -> None:
-    """What does a board's cycle cost, part by part?
+    """Measure the cost of a board's cycle, part by part.
 
     The bench runs boards that compute nothing, and each board of nasrem, in real time and in
     lockstep, alternately with another checkout. Without a checkout, the servo board in lockstep is
@@ -131,7 +131,7 @@ def lockstep(
     rounds: Rounds = 3,
     as_json: Json = False,
 ) -> None:
-    """How fast do nasrem, k1607 and fig4 run in lockstep?
+    """Measure the speed of nasrem, k1607 and fig4 in lockstep.
 
     They run alternately with the lower bound: the same plans and cycles of the same levels in one
     process without a rack, whose messages must equal the rack's bit for bit. Ratios are to TREE if
@@ -155,7 +155,7 @@ def launch(
     share: Share = False,
     as_json: Json = False,
 ) -> None:
-    """How long do launches, commands and reactions take?
+    """Measure the duration of launches, commands and reactions.
 
     A launch is the time from `rack run` to the first cycle of the fastest level; its ratio is to
     the checkout given by --against. The ratio of a short command is to a Python that only imports

@@ -33,11 +33,12 @@ BASE_JOINTS = 3
 
 REFERRING = ("tendon", "equality", "actuator", "contact", "deformable", "sensor", "custom")
 """Sections of an MJCF file that refer to others."""
-KINDS = {"jointinparent": "joint", "node": "body", "subtree": "body", "target": "body"}
+KINDS = {
+    "jointinparent": "joint",
+    **dict.fromkeys(("node", "subtree", "target", "xbody"), "body"),
+    **dict.fromkeys(("refsite", "sidesite", "cranksite", "slidersite"), "site"),
+}
 """Kind of element that an attribute refers to, unless its name is the kind, as in `body1`."""
-KINDS |= {"xbody": "body", "refsite": "site", "sidesite": "site"}
-KINDS |= {"cranksite": "site", "slidersite": "site"}
-"""To what an attribute refers, where its name, but for a number, is not that of the kind."""
 
 
 @dataclass(frozen=True)

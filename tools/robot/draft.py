@@ -352,8 +352,8 @@ def _fit_gripper(draft: Draft) -> FittedGripper:
 def _choose_tool(draft: Draft) -> ToolFrame:
     """Place the tool between the fingers, or at the end of an arm without a usable gripper."""
     if draft.gripper is None:
-        name, offset = tool_outward(draft.cell(), draft.tool.name)
-        return ToolFrame(name, offset, "z along the last joint, outward")
+        tool = tool_outward(draft.cell(), draft.tool.name)
+        return ToolFrame(*tool, "z along the last joint, outward")
     fingertips = draft.gripper.fingertips
     sides = "finger and fixed jaw" if fingertips.is_one else "the fingers"
     guess = f"between {sides}, z out of the hand, y across"

@@ -28,7 +28,7 @@ class MyPlannerStatus(Status, version=1):
 
 
 class MyPlannerLevel(Executor):
-    """Computes the torques that move the arm, beyond those that only hold it."""
+    """Shows how much torque moves the arm, in addition to the torque that holds it."""
 
     servo = Input(ServoStatus, "servo.status")
     plan = Input(MyPlannerPlan, "own.plan")
