@@ -121,9 +121,9 @@ def campaign(
         loads=loads,
         seconds=seconds,
     )
-    is_continued = out is not None and (out / ORDER).is_file()
     started = time.monotonic()
-    folder = out if out is not None and is_continued else folder_of(out, "campaign")
+    # An existing campaign is continued in its folder.
+    folder = out if out is not None and (out / ORDER).is_file() else folder_of(out, "campaign")
     with INTERRUPT.orderly(unfinished=NO_TIME.format(folder)):
         with progress_for(silent=as_json) as progress:
             work = Campaign(order, folder, progress, whole)

@@ -77,7 +77,7 @@ def new(
     if folder.exists():
         raise Failure(f"--out: '{folder}' exists already; name a new folder", 2)
     chain = tuple(filter(None, joints.split(",")))
-    wanted = Wishes(tip, chain, tool, gripper, home, _numbers(torque, "--torque"))
+    wanted = Wishes(tip, chain, tool, gripper, home, _numbers(torque))
     with drafting(model) as draft:
         made = _made(model, wanted, draft / name, name, asks)
         shutil.copytree(draft / name, folder)
@@ -194,11 +194,12 @@ def _without(folder: Path, text: str, model: Path) -> str:
     return re.sub(f"{re.escape(str(folder))}[^']*", lambda _: str(model), text)
 
 
-def _numbers(text: str, option: str) -> tuple[float, ...]:
+def _numbers(text: str) -> tuple[float, ...]:
+    """Parse torque limits. Raises `Failure`."""
     try:
         return tuple(float(number) for number in text.split(",") if text)
     except ValueError:
-        raise Failure(f"{option} = {text}: must be numbers, as in 80,80,12", 2) from None
+        raise Failure(f"--torque = {text}: must be numbers, as in 80,80,12", 2) from None
 
 
 def _made(model: Path, wanted: Wishes, folder: Path, name: str, asks: bool) -> Document:

@@ -261,8 +261,8 @@ def _draft(source: Source, wishes: Wishes, folder: Path, name: str) -> Draft:
     result.limits = limits = _compute_limits(result)
     if limits.bandwidth is not None:
         notes.append(
-            f"a joint loop of {limits.bandwidth:g} rad/s: at {LoopGains().bandwidth:g} dry friction"
-            f" may hold a joint {1e3 * limits.friction_error:.1f} mrad from its goal"
+            f"the joint loop has {limits.bandwidth:g} rad/s: with {LoopGains().bandwidth:g} dry"
+            f" friction may hold a joint {1e3 * limits.friction_error:.1f} mrad from its goal"
         )
     result.home = find_home(result)
     return result
@@ -271,14 +271,16 @@ def _draft(source: Source, wishes: Wishes, folder: Path, name: str) -> Draft:
 def _describe_rest(model: mujoco.MjModel, arm: ArmParts, left_out: list[str]) -> Iterator[str]:
     """Yield notes about parts of the model that the draft leaves out, fixes or cannot limit."""
     if left_out:
-        yield f"left out, as nothing holds it: {listed(left_out)}"
+        yield f"left out, because they are not attached: {listed(left_out)}"
     if endless := [joint for joint in arm.joints if not model.joint(joint).limited]:
-        yield f"without limits: {listed(endless)}; [robot] position can state them"
+        yield f"joints without limits: {listed(endless)}; [robot] position can state them"
     if arm.passive:
-        why = "nothing drives them: --joints would; those without a spring are held"
-        yield f"passive, beyond the arm: {listed([*arm.passive])}; {why}"
+        yield (
+            f"passive joints beyond the arm: {listed([*arm.passive])}; those without a spring are"
+            " fixed; --joints drives them"
+        )
     if arm.others:
-        yield f"held: what begins at {listed([*arm.others])}; --tip chooses another arm"
+        yield f"fixed: other arms that begin at {listed([*arm.others])}; --tip chooses one of them"
 
 
 def _read_limits(
@@ -484,7 +486,7 @@ def find_home(draft: Draft, scene: SceneConfig = NOTHING, ends: Sequence[Array] 
         except ValueError:
             known = listed(list(keyframes))
             raise RobotError(
-                f"--home: '{wanted}' is no keyframe: {known}; valid, too: q1,q2,..."
+                f"--home: '{wanted}' is not a keyframe; valid: {known}, or q1,q2,..."
             ) from None
     named = sorted(keyframes, key=lambda name: name != (wanted or "home"))
     for name in named:
@@ -501,6 +503,6 @@ def find_home(draft: Draft, scene: SceneConfig = NOTHING, ends: Sequence[Array] 
     best = max((q for q in poses(cell) if left(q) > 0), key=rate_pose, default=None)
     if best is None:
         raise RobotError(
-            "no pose is free of contact and carries itself; --home q1,q2,... states one"
+            "no pose was found that is free of contact and held by the motors; give one with --home"
         )
     return Home(best.round(4).tolist(), "free of contact, the tool as far down as found")

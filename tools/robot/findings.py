@@ -106,7 +106,7 @@ def _findings(
         if model.jnt_qposadr[k] not in known_addresses
     }
     names = sorted(model.body(body).name for body in loose_bodies)
-    yield Observation("bodies that nothing holds", ", ".join(names) or "none", bool(names))
+    yield Observation("unattached bodies", ", ".join(names) or "none", bool(names))
     kinds = Counter(map(_kind, load_spec(robot.model).actuators))
     yield Observation(
         "actuators", ", ".join(f"{n} {kind}" for kind, n in kinds.items()) or "none", False

@@ -78,7 +78,7 @@ def find_fingertips(cell: Cell, tip: str, is_one: bool = False) -> Fingertips:
     across = fingers.across
     points = [place for place in fingers.places() if np.isfinite(fingers.gap(place)).all()]
     if not points:
-        raise RobotError("fingers that do not close on each other, nor on a jaw")
+        raise RobotError("the fingers close neither on each other nor on a jaw")
     origin = points[min(int(FROM_TIP_M / STEP_M), len(points) // 2)]
     left, right = fingers.gap(origin)
     if not fingers.is_one:
@@ -90,7 +90,7 @@ def find_fingertips(cell: Cell, tip: str, is_one: bool = False) -> Fingertips:
             break
     if not LEAST_GAP_M < width < np.inf:
         raise RobotError(
-            f"fingers that open {1e3 * width:.0f} mm; {1e3 * LEAST_GAP_M:g} are needed"
+            f"the fingers open by {1e3 * width:.0f} mm; {1e3 * LEAST_GAP_M:g} mm are needed"
         )
     block = BLOCK_PART * width
     if fingers.is_one:
@@ -121,7 +121,7 @@ class _Fingers:
         displacements = self.close(NEARLY) - closed
         is_moving = np.linalg.norm(displacements, axis=1) > LEAST_WAY_M
         if not is_moving.any():
-            raise RobotError("fingers that do not move")
+            raise RobotError("the fingers do not move")
         displacements = displacements[is_moving]
         self.is_one = is_one or bool((displacements @ displacements.T).min() >= 0.0)
         self.near = NEARER if self.is_one else NEARLY

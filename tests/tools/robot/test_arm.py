@@ -125,7 +125,9 @@ def test_springs_stay_springs_and_other_passive_joints_are_held(tmp_path: Path) 
     assert set(names) == {*JOINTS, "flex1"}
     assert model.joint("flex1").stiffness[0] == 20.0
     assert model.nu == len(JOINTS)
-    assert any(note.startswith("passive, beyond the arm: flex1, loose;") for note in made.notes)
+    assert any(
+        note.startswith("passive joints beyond the arm: flex1, loose;") for note in made.notes
+    )
 
 
 BASE = 'inertia ixx="{}" iyy="0.01" izz="0.01" ixy="{}"'
@@ -167,7 +169,7 @@ def test_an_invalid_range_is_reported_and_mujoco_prints_nothing(
     monkeypatch.chdir(tmp_path)
     source = read_source(written(tmp_path, urdf(gripper=False).replace(LIMITS, limits, 3)))
     made = draft(source, Wishes(), tmp_path, "drafted")
-    assert "without limits: j1, j2, j3; [robot] position can state them" in made.notes
+    assert "joints without limits: j1, j2, j3; [robot] position can state them" in made.notes
     assert capfd.readouterr() == ("", "")
     assert not (tmp_path / "MUJOCO_LOG.TXT").exists()
 

@@ -45,7 +45,7 @@ def test_contacts_at_home_unattached_bodies_and_endless_falls_fail(tmp_path: Pat
     text = text.replace("home = [0.0, -0.6", "home = [0.0, 1.2")
     found = failing(checked(tmp_path, written(tmp_path, text, "own.toml"), 1))
     assert "desk" in found["contacts at home"] or "world" in found["contacts at home"]
-    assert found["bodies that nothing holds"] == "flap"
+    assert found["unattached bodies"] == "flap"
     assert found["objects"] == "'cup' falls without end"
 
 

@@ -61,7 +61,7 @@ def test_a_finger_that_meets_nothing_is_fixed_with_a_note(tmp_path: Path) -> Non
     model.write_text(model.read_text().replace(grippers.FIXED, ""))
     made = drafted(tmp_path, robot.model)
     assert made.robot.gripper is None
-    assert "no gripper: fingers that do not close on each other, nor on a jaw" in made.notes
+    assert "no gripper: the fingers close neither on each other nor on a jaw" in made.notes
     assert [joint.name for joint in made.spec.joints] == list(made.robot.joints)
 
 
