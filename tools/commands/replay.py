@@ -111,7 +111,10 @@ def _show(*recordings: Path) -> None:
 
 
 def _make(runs: Sequence[Path], out: Path, place: Places) -> None:
-    """Write the file of `merge`, printing its notes. Raises `Failure` if `out` is not usable."""
+    """Write the file of `merge_runs`, printing its notes.
+
+    Raises `Failure` for an unusable `out`.
+    """
     if out.suffix != ".rrd":
         raise Failure(f"--out {out}: the name of a file for the viewer must end in .rrd", 2)
     if out.exists():

@@ -3,7 +3,7 @@
 They leave no process and no segment behind. A command with nothing to finish ends inside the signal
 handler. Python's own way, an exception raised there, was rejected: it may strike after a segment
 has been created and before its owner has been recorded, and libraries that are being imported turn
-it into other errors. A command with something to finish uses `orderly`, and gets `BOUND_S`.
+it into other errors. A command with something to finish uses `stop_orderly`, and gets `BOUND_S`.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ class Interrupt:
             self._ways.pop()
 
     def at_once(self) -> AbstractContextManager[None]:
-        """Let a signal end the process in its handler, even inside `orderly`."""
+        """Let a signal end the process in its handler, even inside `stop_orderly`."""
         return self.orderly(self.end)
 
     def raising(self) -> AbstractContextManager[None]:

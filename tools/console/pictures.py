@@ -32,7 +32,7 @@ def picture(
     """Provide an empty figure, and save it when the context ends. Equal figures make equal files.
 
     Args:
-        paths: Files to write, with endings in `KINDS`.
+        paths: Files to write, with endings in `PICTURE_FORMATS`.
         width_in: Width in inches.
         height_in: Height in inches.
         settings: Further arguments of `Figure`.

@@ -74,7 +74,7 @@ def fitted(
 def fitted_records(
     records: Sequence[Mapping[str, object]], dropped: Sequence[str] = ()
 ) -> Iterator[str]:
-    """Yield the lines of a table like `fitted`, with a row for each record.
+    """Yield the lines of a table like `format_fitted_table`, with a row for each record.
 
     The keys of the first record are the columns.
     """

@@ -94,7 +94,7 @@ class OtherRacks:
             rack.process.terminate()
 
     def finish(self) -> str:
-        """Wait for the end of the racks, and return their failures as `failure` does."""
+        """Wait for the end of the racks, and return their failures as `describe_failures` does."""
         deadline = time.monotonic() + (STOP_S if self._is_stopped else END_S)
         late = []
         for rack in self._racks:

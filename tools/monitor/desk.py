@@ -57,7 +57,7 @@ class LiveDesk:
         ]
 
     def text(self) -> Iterator[str]:
-        """Yield the lines of a table of `levels`."""
+        """Yield the lines of a table of `list_levels`."""
         return fitted(["level", "in force", "takes"], [list(row.values()) for row in self.levels()])
 
     def highest(self, *in_force: str) -> list[str]:
@@ -106,11 +106,11 @@ class LiveDesk:
         If this process ends or falls silent before that, the level holds.
 
         Args:
-            given: As in `give`.
+            given: As in `give_command`.
             tell: Called with the reply of the level.
 
         Raises:
-            Failure: As in `give`, and for a command that does not stay in force.
+            Failure: As in `give_command`, and for a command that does not stay in force.
         """
         command, clock_request = self._request(given)
         segment = self._segment
@@ -132,7 +132,7 @@ class LiveDesk:
         return Operation.HOLD in (self._levels[level].commands)
 
     def _request(self, given: Mapping[str, Any]) -> tuple[CommandConfig, Request]:
-        """Build a command and its request to the clock. Raises like `give`."""
+        """Build a command and its request to the clock. Raises like `give_command`."""
         tick = self._segment.words[System.TICK]
         command = asked({key: value for key, value in given.items() if value is not None})
         wanted = request(command, self._config, self._levels, self._segment.layout)
@@ -152,7 +152,7 @@ class LiveDesk:
             at: The same in simulated seconds.
 
         Raises:
-            Failure: The parameter is not live, or as in `give`.
+            Failure: The parameter is not live, or as in `give_command`.
         """
         place, _, _ = setting.partition("=")[0].rpartition(".")
         live = {

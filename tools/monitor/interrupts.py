@@ -75,7 +75,7 @@ class Arrivals(NamedTuple):
 
     mailbox: np.ndarray  # number of the mailbox, as `Layout.interrupting` counts
     sent_ns: np.ndarray
-    end_ns: np.ndarray  # end of service; `LOST` if the inbox was full
+    end_ns: np.ndarray  # end of service; `NEVER_SERVED` if the inbox was full
     most_waiting: int
 
 

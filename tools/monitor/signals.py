@@ -65,7 +65,7 @@ class Strip:
         segment: The rack.
         signals: Signals to keep.
         span: Number of ticks to keep, with one more message of each mailbox before them.
-        followed: Signals whose messages `take` returns without keeping them.
+        followed: Signals whose messages `read_new` returns without keeping them.
     """
 
     def __init__(

@@ -1,6 +1,6 @@
 """Drafts a `[robot]` table from a model file, and names every value that is a guess.
 
-`_draft` runs the steps. Each returns one record: limits, gripper, tool, overlaps, home.
+`_run_steps` runs the steps. Each returns one record: limits, gripper, tool, overlaps, home.
 `Draft.table` composes them.
 """
 
@@ -125,7 +125,7 @@ class JointLimits:
 
 @dataclass
 class Draft:
-    """A drafted arm: one record for each step of `_draft`, composed to a table by `table`."""
+    """A drafted arm: one record for each step of `_run_steps`, composed to a table by `table`."""
 
     model: Path  # MJCF file of the draft
     spec: mujoco.MjSpec  # content of that file, possibly with changes not yet written
@@ -495,7 +495,7 @@ def find_home(draft: Draft, scene: SceneConfig = NOTHING, ends: Sequence[Array] 
     set_margins(cell.model, 0.5 * APART_M)
 
     def rate_pose(q: Array) -> float:
-        # Forward kinematics at `q` is a side effect of `touching`.
+        # Forward kinematics at `q` is a side effect of `find_touching_bodies`.
         is_near = bool(touching(cell, data, q, APART_M))
         downward = -float(data.site_xmat[cell.tool, 8])
         return left(q) + downward - 2.0 * is_near

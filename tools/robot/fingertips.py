@@ -47,7 +47,7 @@ ASIDE_M = (0.0, 0.01, -0.01, 0.02, -0.02)
 ALIGNED = 0.98
 """Cosine above which a direction is replaced by the axis of the body."""
 ABOUT = 0.9
-"""Like `ALIGNED`, for the direction to a single finger, which lies beside the middle of the hand.
+"""Like `ALIGNED_COSINE`, for the direction to a single finger, which is beside the hand's centre.
 """
 
 

@@ -141,7 +141,7 @@ class RewoundRun:
         )
 
     def _shown(self, name: str, value: Any, lines: Iterable[str]) -> Glance:
-        """Build the answer of `show`."""
+        """Build the answer of `show_name`."""
         where = {"tick": self.tick, "time_s": self.time_s(self.tick)}
         return Glance({**where, "name": name, "value": value}, lines)
 
