@@ -243,9 +243,11 @@ def commands() -> TyperGroup:
 
         def format_commands(self, ctx: Any, formatter: Any) -> None:
             """Write a table of the commands for each group."""
-            for group, found in COMMANDS.items():
+            for group, group_commands in COMMANDS.items():
                 with formatter.section(group):
-                    formatter.write_dl([(f"{name:9}", line) for name, line in found.items()])
+                    formatter.write_dl(
+                        [(f"{name:9}", line) for name, line in group_commands.items()]
+                    )
 
     class LazyCommand(TyperCommand):
         """A command that is loaded on use. Until then only its name and line of help are known."""
@@ -287,7 +289,9 @@ def commands() -> TyperGroup:
     app.callback()(rack)
     group = typer.main.get_command(app)
     assert isinstance(group, TyperGroup), "it has a callback"
-    for name, line in chain.from_iterable(found.items() for found in COMMANDS.values()):
+    for name, line in chain.from_iterable(
+        group_commands.items() for group_commands in COMMANDS.values()
+    ):
         group.add_command(LazyCommand(name, short_help=line))
     return group
 

@@ -69,17 +69,17 @@ def estop(
     if "/" in rack:
         tick = _stop_from_afar(RackAddress.of(rack), reset, ready, Operator.of(name, certificates))
         rack_name = rack.partition("/")[2]
-        held = ""
+        wait_reason = ""
     else:
-        tick, held = _latch(rack, reset)
+        tick, wait_reason = _latch(rack, reset)
         rack_name = rack
     where = ", on its own machine" if rack_name != rack else ""
     state = f"reset at tick {tick}" if reset else f"latched at tick {tick}"
-    if held:
-        state += f"; the arm {held}"
+    if wait_reason:
+        state += f"; the arm {wait_reason}"
     if not reset:
         state += f"; to release{where}: rack estop {rack_name} --reset"
-    document = {"rack": rack_name, "emergency_stop": not reset, "tick": tick, "waits": held}
+    document = {"rack": rack_name, "emergency_stop": not reset, "tick": tick, "waits": wait_reason}
     print_answer(document, f"rack '{rack}': emergency stop {state}", as_json)
 
 

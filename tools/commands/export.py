@@ -43,17 +43,19 @@ def export(
     if path.exists():
         raise Failure(f"{path}: exists already; remove it, or give another --out", 2)
     # Write to a temporary file, so that no incomplete file is left after Ctrl-C.
-    part = path.with_name(f"{path.name}.part")
+    partial_file = path.with_name(f"{path.name}.part")
     try:
         with INTERRUPT.raising():
-            count = exchange_file.export(recording, part, reading_progress(as_json, "exported"))
-        part.rename(path)
+            count = exchange_file.export(
+                recording, partial_file, reading_progress(as_json, "exported")
+            )
+        partial_file.rename(path)
     except OSError as error:
         if error.filename is not None:
             raise
         raise Failure(f"{path}: {error.strerror}") from None
     finally:
-        part.unlink(missing_ok=True)
+        partial_file.unlink(missing_ok=True)
     size = path.stat().st_size
     document = {"file": str(path), "messages": count, "bytes": size}
     print_answer(document, f"{path}: {count:,} messages, {size * 1e-6:.1f} MB", as_json)

@@ -120,12 +120,12 @@ class RewindPrompt(cmd.Cmd):
         text = one_line(why, MAX_LINE)
         print(encode_json({"error": text}) if self._as_json else text, flush=True)
 
-    def _answer(self, found: Glance) -> None:
+    def _answer(self, answer: Glance) -> None:
         """Print an answer, as JSON or as lines."""
         if self._as_json:
-            print(encode_json(found.document), flush=True)
+            print(encode_json(answer.document), flush=True)
         else:
-            print(*found.lines, sep="\n", flush=True)
+            print(*answer.lines, sep="\n", flush=True)
 
     def emptyline(self) -> bool:
         """Do nothing on an empty line, so that a branch is not repeated by accident."""

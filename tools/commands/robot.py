@@ -79,9 +79,9 @@ def new(
     chain = tuple(filter(None, joints.split(",")))
     wanted = Wishes(tip, chain, tool, gripper, home, _numbers(torque))
     with drafting(model) as draft:
-        made = _made(model, wanted, draft / name, name, asks)
+        document = _made(model, wanted, draft / name, name, asks)
         shutil.copytree(draft / name, folder)
-    print_answer(made | {"folder": str(folder)}, _lines(made, folder, name), as_json)
+    print_answer(document | {"folder": str(folder)}, _lines(document, folder, name), as_json)
 
 
 @app.command("check")
@@ -150,8 +150,8 @@ def _report(document: Document) -> Iterator[str]:
 
 def _asked(text: str, default: str = "") -> str:
     """Ask the user for a value. An empty answer means the default, or what the draft will find."""
-    shown = text if default else f"{text} [found]"
-    return str(typer.prompt(shown, default, show_default=bool(default))).strip()
+    question = text if default else f"{text} [found]"
+    return str(typer.prompt(question, default, show_default=bool(default))).strip()
 
 
 def _completed(source: Source, wanted: Wishes) -> Wishes:
@@ -226,10 +226,11 @@ def _made(model: Path, wanted: Wishes, folder: Path, name: str, asks: bool) -> D
     return document(drafted, layout, folder, name)
 
 
-def _lines(made: Document, folder: Path, name: str) -> Iterator[str]:
-    yield f"{folder}: {len(made['joints'])} joints, {', '.join(made['joints'])}; {made['task']}"
-    yield from made["notes"]
-    for key, why in made["guessed"].items():
+def _lines(document: Document, folder: Path, name: str) -> Iterator[str]:
+    joints = document["joints"]
+    yield f"{folder}: {len(joints)} joints, {', '.join(joints)}; {document['task']}"
+    yield from document["notes"]
+    for key, why in document["guessed"].items():
         yield f"guessed: {key}: {why}"
     config_path = folder / f"{name}.toml"
     # A file beside the folder would be found first under that name.

@@ -59,5 +59,5 @@ def step(
         stepper.after_cycles(held_tick, cycles or 1, until) if ticks is None else held_tick + ticks
     )
     stepper.go(end_tick)
-    found = stepper.look()
-    print_answer(asdict(found), found.lines(), as_json)
+    held_rack = stepper.look()
+    print_answer(asdict(held_rack), held_rack.lines(), as_json)

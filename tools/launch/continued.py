@@ -172,8 +172,8 @@ class RunAgain:
         """Return the attributes of the levels' objects before `tick`, by task."""
         self.reach(tick)
         tasks = [task.name for task in self.recording.layout.tasks]
-        shown = {task: self.crate.show(tick, task).attributes for task in tasks}
-        return {task: json.loads(text) for task, text in shown.items() if text}
+        texts = {task: self.crate.show(tick, task).attributes for task in tasks}
+        return {task: json.loads(text) for task, text in texts.items() if text}
 
     def _begin(self, tick: int) -> Beginning:
         """Return the state from which this run is repeated towards `tick`."""
@@ -201,7 +201,7 @@ class RunAgain:
         died = (event for event in self.recording.events if event["kind"] == "died")
         earlier = () if self._parent is None else self._parent._losses
         before = (loss for loss in earlier if loss[1] < (self._branched_at or 0))
-        return (*before, *((one["board"], one["tick"]) for one in died))
+        return (*before, *((death["board"], death["tick"]) for death in died))
 
     def _nearest(self, tick: int) -> int:
         """Return the tick of the newest snapshot up to `tick`."""
@@ -299,8 +299,8 @@ def tick_in(recording: Recording, text: str, asked: str = "") -> int:
     begins, ends = ticks_of(recording)
     if not (begins <= tick < ends and is_kept):
         first, last = (at * recording.layout.clock_ns * 1e-9 for at in (begins, ends - 1))
-        kept = f"; {recording.kept_text}" if recording.kept else ""
-        raise Failure(f"{asked}{text}: must be {first:g} to {last:g} s{kept}", 2)
+        suffix = f"; {recording.kept_text}" if recording.kept else ""
+        raise Failure(f"{asked}{text}: must be {first:g} to {last:g} s{suffix}", 2)
     return tick
 
 

@@ -352,10 +352,10 @@ def compare_recording(
         gaps = Recording(folder).gaps({name: rows for name, (rows, _) in missing.items()}, ticks)
     except Failure as error:
         return f"{why}; {error}", {}
-    most, name = max((found, name) for name, found in missing.items())
+    most, name = max((loss, name) for name, loss in missing.items())
     text = f"{most.rows:,} of {most.written:,} rows of {name} are missing"
     if len(missing) > 1:
         text += f" (and rows of {len(missing) - 1} more tasks and mailboxes)"
     return "; ".join((text, *map(str, gaps), why)), {
-        name: found.rows for name, found in missing.items()
+        name: loss.rows for name, loss in missing.items()
     }

@@ -47,7 +47,7 @@ class LiveDesk:
         self._segment = segment
         self._config = read_stored(self._segment.config)
         levels = PublishedRack.of_rack(self._segment).levels
-        self._levels = {name: one for name, one in levels.items() if one.commands}
+        self._levels = {name: published for name, published in levels.items() if published.commands}
 
     def levels(self) -> list[dict[str, str]]:
         """List the commands that each level takes, and the one in force, as plain data."""
@@ -115,7 +115,7 @@ class LiveDesk:
         command, clock_request = self._request(given)
         segment = self._segment
         if command.said not in EFFECTS or not self._takes_hold(command.level):
-            lasting = ", ".join(what.name.lower() for what in EFFECTS)
+            lasting = ", ".join(operation.name.lower() for operation in EFFECTS)
             why = f"must be one of {lasting}, to a level that can hold"
             raise Failure(f"--lease: '{command.level}', {command.what}: {why}", 2)
         if wait_text := waits(segment):
@@ -131,10 +131,10 @@ class LiveDesk:
     def _takes_hold(self, level: str) -> bool:
         return Operation.HOLD in (self._levels[level].commands)
 
-    def _request(self, given: Mapping[str, Any]) -> tuple[CommandConfig, Request]:
+    def _request(self, fields: Mapping[str, Any]) -> tuple[CommandConfig, Request]:
         """Build a command and its request to the clock. Raises like `give_command`."""
         tick = self._segment.words[System.TICK]
-        command = asked({key: value for key, value in given.items() if value is not None})
+        command = asked({key: value for key, value in fields.items() if value is not None})
         wanted = request(command, self._config, self._levels, self._segment.layout)
         if 0 <= wanted.tick <= tick:
             key, value = ("tick", command.tick) if command.at is None else ("at", command.at)
@@ -156,7 +156,9 @@ class LiveDesk:
         """
         place, _, _ = setting.partition("=")[0].rpartition(".")
         live = {
-            name: one.live for name, one in self._levels.items() if Operation.SET in one.commands
+            name: published.live
+            for name, published in self._levels.items()
+            if Operation.SET in published.commands
         }
         level = next((level for level in live if place == f"board.{level}.params"), None)
         if level is None:
@@ -165,8 +167,8 @@ class LiveDesk:
                 f"{setting}: not a live parameter; valid keys: {', '.join(known) or 'none'}", 2
             )
         name = setting.removeprefix(f"{place}.")
-        given = {"level": level, "what": "set", "name": name, "tick": tick, "at": at}
-        return self.give(given, wait=False)
+        fields = {"level": level, "what": "set", "name": name, "tick": tick, "at": at}
+        return self.give(fields, wait=False)
 
     def _await_giving(self, entry: RequestEntry, level: str) -> Reply:
         """Wait until the clock has given a command to its level. Raises `Failure`."""

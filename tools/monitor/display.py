@@ -175,20 +175,24 @@ class RackView:
         yield from (Text(f"{row.task}: {row.row}") for row in snapshot.tasks if row.row)
         sides: tuple[Sequence[Any], ...] = (snapshot.hosts, snapshot.entries)
         for rows in (*sides, snapshot.peers, snapshot.imports, snapshot.exports):
-            if found := [asdict(row) for row in rows]:
-                cells = [[_cell(*pair) for pair in row.items()] for row in found]
+            if records := [asdict(row) for row in rows]:
+                cells = [[_cell(*pair) for pair in row.items()] for row in records]
                 yield Text()
-                yield grid([key.replace("_", " ") for key in found[0]], cells, width, style=_style)
+                yield grid(
+                    [key.replace("_", " ") for key in records[0]], cells, width, style=_style
+                )
         yield from (Text(line, style="red") for line in _reasons(snapshot))
         yield from (Text(queue.line) for queue in snapshot.queues)
         yield from (Text(inbox.line) for inbox in snapshot.inboxes)
-        yield from (Text(_exchange(*found)) for found in snapshot.exchanges.items())
+        yield from (Text(_exchange(*ages)) for ages in snapshot.exchanges.items())
         yield from (Text(f"fault: {fault}", style="magenta") for fault in snapshot.faults)
         for hold in snapshot.holds:
             # Split a long line in two, so that the command in it is not wrapped.
             is_long = len(hold.line) > width
-            shown = hold.line.replace("; to release", "\n  to release") if is_long else hold.line
-            yield Text(shown, style=HELD)
+            hold_text = (
+                hold.line.replace("; to release", "\n  to release") if is_long else hold.line
+            )
+            yield Text(hold_text, style=HELD)
         if (at := snapshot.progress) is not None:
             actions = f"{at.actions_done}/{at.actions}"
             yield Text(f"task: action {actions}, move {at.moves_done}/{at.moves} {at.state}")
@@ -243,23 +247,21 @@ def _demanded(snapshot: Snapshot) -> list[str]:
 
 def _reasons(snapshot: Snapshot) -> list[str]:
     """Return the reasons that tasks give, except those that a hold already shows."""
-    held = {hold.level for hold in snapshot.holds}
-    shown = [hold.why for hold in snapshot.holds]
+    held_levels = {hold.level for hold in snapshot.holds}
+    shown_reasons = [hold.why for hold in snapshot.holds]
     return [
         f"{row.task}: {row.reason}"
         for row in snapshot.tasks
         if row.reason
-        and not (row.state == "holding" and row.task in held)
-        and is_news(row.reason, shown)
+        and not (row.state == "holding" and row.task in held_levels)
+        and is_news(row.reason, shown_reasons)
     ]
 
 
 def _exchange(board: str, ports: Mapping[str, PortAge]) -> str:
     """Format the ages of a board's exchanged messages as one line."""
-    shown = [
-        f"{port} {age.age} ticks old, taken at tick {age.taken}" for port, age in ports.items()
-    ]
-    return f"exchange of {board}: {'; '.join(shown) or 'no message yet'}"
+    ages = [f"{port} {age.age} ticks old, taken at tick {age.taken}" for port, age in ports.items()]
+    return f"exchange of {board}: {'; '.join(ages) or 'no message yet'}"
 
 
 def _style(column: str, text: str) -> str:

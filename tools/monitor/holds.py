@@ -49,8 +49,8 @@ class Hold:
     @property
     def line(self) -> str:
         """The hold as one line of text."""
-        how = f"; to release: {self.release}" if self.release else ""
-        return f"{self.level} {self.why}, since {self.since_s:.2f} s{how}"
+        release_text = f"; to release: {self.release}" if self.release else ""
+        return f"{self.level} {self.why}, since {self.since_s:.2f} s{release_text}"
 
 
 def resume_command(rack: str, level: str) -> str:
@@ -97,17 +97,15 @@ def _find_holds(newest: Newest) -> Iterator[Hold]:
         if level not in tasks:
             continue
         if _fields(status) >= OPERATED and status.standing:
-            since, serial, arm_name = _command_in_force(segment, level, status)
+            since, serial, command_text = _command_in_force(segment, level, status)
             is_hold = status.standing == Operation.HOLD
             is_done = status.answer == Answer.DONE and serial in (status.order, 0)
             done = ", done" if is_done and not is_hold else ""
-            why = f"{'held' if is_hold else 'diverted'} by the operator ({arm_name}{done})"
+            why = f"{'held' if is_hold else 'diverted'} by the operator ({command_text}{done})"
             yield hold(level, since, why, resume_command(segment.rack, level))
         elif status.state == State.HOLDING:
-            needed_command = ASKED.get(status.error) if level == arm else None
-            release = (
-                f"rack command {segment.rack} {level} {needed_command}" if needed_command else ""
-            )
+            needed = ASKED.get(status.error) if level == arm else None
+            release = f"rack command {segment.rack} {level} {needed}" if needed else ""
             why = f"holding: {reason_of(status) or 'no reason given'}"
             if release or is_news(why, shown_reasons):
                 yield hold(level, segment.block(level)[Block.LEVEL_SINCE], why, release)
@@ -120,17 +118,17 @@ def _command_in_force(segment: Segment, level: str, status: AnyMessage) -> tuple
         Its tick, its serial and its text. The serial is 0 if its message has been overwritten.
     """
     rows = MailboxRing(segment, f"{level}.operator").drain().rows
-    given = rows["message"]
-    is_candidate = (given["what"] == status.standing) & (given["id"] <= answered(status))
+    commands = rows["message"]
+    is_candidate = (commands["what"] == status.standing) & (commands["id"] <= answered(status))
     # A refused command has left the previous one in force.
     if status.answer == Answer.REFUSED and is_candidate.sum() > 1:
-        is_candidate &= given["id"] != status.order
-    found = rows[is_candidate]
-    if not len(found):
+        is_candidate &= commands["id"] != status.order
+    candidates = rows[is_candidate]
+    if not len(candidates):
         return segment.block(level)[Block.LEVEL_SINCE], 0, Operation(status.standing).name.lower()
-    answering = found[found["message"]["id"] == status.order]
-    row = (answering if len(answering) else found)[-1]
-    message = OperatorCommand(given.dtype)
+    answering = candidates[candidates["message"]["id"] == status.order]
+    row = (answering if len(answering) else candidates)[-1]
+    message = OperatorCommand(commands.dtype)
     message.raw[:] = row["message"].tobytes()
     return int(row["tick"]), message.id, describe(message)
 

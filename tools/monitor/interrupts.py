@@ -53,7 +53,11 @@ def inbox_depths(layout: Layout) -> dict[int, int]:
     """Return the depth of the inbox of every board that messages interrupt, by slot."""
     slots = dict.fromkeys(task.slot for task in layout.tasks)
     boxes = {slot: layout.interrupting(slot) for slot in slots}
-    return {slot: how_sent(found[0]).depth for slot, found in boxes.items() if found}
+    return {
+        slot: how_sent(interrupting[0]).depth
+        for slot, interrupting in boxes.items()
+        if interrupting
+    }
 
 
 def inbox_fills(segment: Segment) -> tuple[InboxFill, ...]:

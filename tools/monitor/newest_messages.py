@@ -44,5 +44,8 @@ class Newest:
     def statuses(self, field: str) -> Iterator[tuple[str, AnyMessage]]:
         """Yield the level and the newest status of every level whose status has a field."""
         return self.messages(
-            lambda box: box.name.endswith(".status") and field in (own.name for own in box.fields)
+            lambda box: (
+                box.name.endswith(".status")
+                and field in (box_field.name for box_field in box.fields)
+            )
         )

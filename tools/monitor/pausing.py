@@ -98,13 +98,13 @@ class Stepper:
 
     def _await_hold(self, tick: int) -> int:
         """Wait until the rack holds before `tick` or a later one, and return that tick."""
-        while (held := self._words[System.HELD] - 1) < tick:
+        while (held_tick := self._words[System.HELD] - 1) < tick:
             if self._segment.run_is_over:
                 raise Failure(
                     f"rack '{self._segment.rack}': its run ended at tick {self._words[System.TICK]}"
                 )
             time.sleep(LOOK_S)
-        return held
+        return held_tick
 
 
 class Pause(NamedTuple):

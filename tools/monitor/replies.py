@@ -110,8 +110,8 @@ class Replies:
         """Read the statuses written since the last call."""
         rows = self._ring.drain().rows
         # Read the commands after the statuses: a command is always older than its answer.
-        given = self._given.drain().rows["message"]
-        self._kinds.update(zip(given["id"].tolist(), given["what"].tolist(), strict=True))
+        commands = self._given.drain().rows["message"]
+        self._kinds.update(zip(commands["id"].tolist(), commands["what"].tolist(), strict=True))
         for row in rows:
             if self.reply.fate in ("given", "taken"):
                 self.reply = self._judge(int(row["tick"]), row["message"])

@@ -113,7 +113,12 @@ class Strip:
 
     def table(self, first: int, last: int) -> Rows:
         """Return a row for each tick from `first` to `last` at which a signal was released."""
-        changes = [one for many in self._changes.values() for one in many if one[0] <= last]
+        changes = [
+            change
+            for mailbox_changes in self._changes.values()
+            for change in mailbox_changes
+            if change[0] <= last
+        ]
         newest: dict[str, Any] = {}
         table: dict[int, list[Any]] = {}
         for tick, values in sorted(changes, key=lambda change: change[0]):
@@ -227,7 +232,7 @@ class Plot:
 def _numbers(name: str, value: Any) -> Iterator[tuple[str, float]]:
     """Yield the numbers of a value, each with its name."""
     if isinstance(value, list):
-        for index, part in enumerate(value):
-            yield from _numbers(f"[{index}] {name}", part)
+        for index, element in enumerate(value):
+            yield from _numbers(f"[{index}] {name}", element)
     elif isinstance(value, int | float):
         yield name, value

@@ -117,8 +117,8 @@ def driven_joints(model: mujoco.MjModel) -> set[int]:
     """
     every = np.arange(model.njnt)
     drives = actuator_moments(model, every, model.qpos0[model.jnt_qposadr]).any(axis=0)
-    own = every[drives | model.jnt_actfrclimited]
-    return set(own.tolist()).union(*(tied_joints(model, k) for k in range(model.neq)))
+    driven = every[drives | model.jnt_actfrclimited]
+    return set(driven.tolist()).union(*(tied_joints(model, k) for k in range(model.neq)))
 
 
 def hold(path: Path, kept: Iterable[str]) -> list[str]:

@@ -314,7 +314,7 @@ def _find_mount(model: mujoco.MjModel, tip: str) -> str:
         if model.body_parentid[body] in carried and not model.body_jntnum[body]:
             carried.append(body)
     names = [model.body(body).name for body in carried]
-    named = [name for part in TOOLS for name in names[1:] if part in name.lower()]
+    named = [name for name_part in TOOLS for name in names[1:] if name_part in name.lower()]
     return str((named or names[-1:])[0])
 
 

@@ -56,9 +56,9 @@ def fit_fingers(
     """
     fingers = {name: _finger(spec, model, arm, name) for name in arm.fingers}
     drives = [
-        (actuator, found[0])
+        (actuator, driven_fingers[0])
         for actuator in spec.actuators
-        if (found := [joint for joint in driven_by(spec, actuator) if joint in fingers])
+        if (driven_fingers := [joint for joint in driven_by(spec, actuator) if joint in fingers])
     ]
     drives.sort(key=lambda drive: (drive[1] != wanted, fingers[drive[1]].sideways))
     driven = drives[0][1] if drives else wanted or arm.fingers[0]

@@ -211,7 +211,7 @@ def _mesh(path: Path, name: str, meshes: str) -> Path:
     within = rest.partition("/")[2]
     tried = [folder / rest, folder / meshes / Path(rest).name]
     if is_package:
-        tried += [above / part for above in folder.parents for part in (rest, within)]
+        tried += [above / relative for above in folder.parents for relative in (rest, within)]
         tried.append(folder / within)
     files = [
         file.with_suffix(suffix)
@@ -219,15 +219,15 @@ def _mesh(path: Path, name: str, meshes: str) -> Path:
         for suffix in (file.suffix, *READ)
         if suffix.lower() in READ
     ]
-    found = find_file(files)
-    if found is None:
+    mesh_file = find_file(files)
+    if mesh_file is None:
         other = find_file(tried)
         why = f"looked for as {listed([*dict.fromkeys(map(str, tried))], most=6)}"
         if other is not None:
             why = f"convert '{other}', in its folder, as Collada and the like are not read"
         raise RobotError(f"model '{path}': no mesh '{name}': {why}; valid: {', '.join(READ)}")
-    check_asset(found, path)
-    return found
+    check_asset(mesh_file, path)
+    return mesh_file
 
 
 def copy_model(source: Source, path: Path) -> None:

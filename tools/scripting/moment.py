@@ -57,10 +57,10 @@ class RecordedMoment:
     @property
     def mailboxes(self) -> dict[str, AnyMessage]:
         """The messages in force, by mailbox."""
-        found = (box.name for box in self._recording.layout.timed)
+        names = (box.name for box in self._recording.layout.timed)
         return {
             name: self.read(name)
-            for name in found
+            for name in names
             if self._in_force.row(name, self.tick) is not None
         }
 

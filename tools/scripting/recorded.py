@@ -110,8 +110,8 @@ class RecordedSignal:
         self.shape = signal.shape[len(signal.index) :]
 
     def __repr__(self) -> str:
-        what = [self.unit] * bool(self.unit) + [f"shape {self.shape}"] * bool(self.shape)
-        return f"<signal {', '.join([self.name, *what])}: {self.meaning}>"
+        properties = [self.unit] * bool(self.unit) + [f"shape {self.shape}"] * bool(self.shape)
+        return f"<signal {', '.join([self.name, *properties])}: {self.meaning}>"
 
     @cached_property
     def values(self) -> np.ndarray:

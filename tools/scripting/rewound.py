@@ -166,8 +166,8 @@ class RewoundRun:
         events = (event for event in self.recording.events if event.get("tick", -1) >= 0)
         nearby_events = [event for event in events if abs(event["tick"] - self.tick) <= span]
         lines = [
-            f"{self.time_s(event_['tick']):g} s  {event_text(Event(**event_))}"
-            for event_ in nearby_events
+            f"{self.time_s(near['tick']):g} s  {event_text(Event(**near))}"
+            for near in nearby_events
         ]
         nothing = f"no events within {around_s:g} s of {self._now}"
         return Glance({"tick": self.tick, "events": nearby_events}, lines or [nothing])
