@@ -102,7 +102,7 @@ class ToolFrame(NamedTuple):
     guess: str = ""
 
 
-class Home(NamedTuple):
+class HomePose(NamedTuple):
     """Position to which tasks return."""
 
     position: list[float]  # (joints,), rad
@@ -135,7 +135,7 @@ class Draft:
     notes: list[str]
     limits: JointLimits
     tool: ToolFrame
-    home: Home
+    home: HomePose
     gripper: FittedGripper | None = None
     exclude: tuple[tuple[str, str], ...] = ()
 
@@ -244,7 +244,7 @@ def _draft(source: Source, wishes: Wishes, folder: Path, name: str) -> Draft:
     spec = load_spec(path)
     limits = _read_limits(source, model, spec, arm.joints, wishes.torque)
     tool = ToolFrame(wishes.tool or _find_mount(compile_spec(spec, path), arm.tip))
-    home = Home([0.0] * len(arm.joints))
+    home = HomePose([0.0] * len(arm.joints))
     result = Draft(path, spec, wishes, arm, keyframes, notes, limits, tool, home)
     if fingers:
         try:
@@ -343,7 +343,7 @@ def _fit_gripper(draft: Draft) -> FittedGripper:
         fingertips = find_fingertips(draft.cell(gripper=config), arm.tip, is_one=True)
     config = config.model_copy(update={"open": round(fingertips.opening, 5)})
     cell = draft.cell(gripper=config)
-    # Home is not known yet, so let the fingers settle without contacts with the rest of the arm.
+    # HomePose is not known yet, so let the fingers settle without contacts with the rest of the arm.
     is_gripper = np.isin(np.arange(cell.model.ngeom), cell.gripper_geoms)
     cell.model.geom_contype *= is_gripper
     cell.model.geom_conaffinity *= is_gripper
@@ -448,7 +448,7 @@ def _rounded(values: Array) -> list[float]:
     return [float(f"{value:.3g}") for value in values]
 
 
-def find_home(draft: Draft, scene: SceneConfig = NOTHING, ends: Sequence[Array] = ()) -> Home:
+def find_home(draft: Draft, scene: SceneConfig = NOTHING, ends: Sequence[Array] = ()) -> HomePose:
     """Find a home in which the arm carries itself and touches nothing.
 
     A keyframe that qualifies is preferred. The alternative is the best sampled pose.
@@ -482,7 +482,7 @@ def find_home(draft: Draft, scene: SceneConfig = NOTHING, ends: Sequence[Array] 
 
     if wanted and wanted not in keyframes:
         try:
-            return Home([float(value) for value in wanted.split(",")])
+            return HomePose([float(value) for value in wanted.split(",")])
         except ValueError:
             known = listed(list(keyframes))
             raise RobotError(
@@ -491,7 +491,7 @@ def find_home(draft: Draft, scene: SceneConfig = NOTHING, ends: Sequence[Array] 
     named = sorted(keyframes, key=lambda name: name != (wanted or "home"))
     for name in named:
         if left(keyframes[name]) > 0:
-            return Home(keyframes[name].round(5).tolist())
+            return HomePose(keyframes[name].round(5).tolist())
     set_margins(cell.model, 0.5 * APART_M)
 
     def rate_pose(q: Array) -> float:
@@ -505,4 +505,4 @@ def find_home(draft: Draft, scene: SceneConfig = NOTHING, ends: Sequence[Array] 
         raise RobotError(
             "no pose was found that is free of contact and held by the motors; give one with --home"
         )
-    return Home(best.round(4).tolist(), "free of contact, the tool as far down as found")
+    return HomePose(best.round(4).tolist(), "free of contact, the tool as far down as found")
