@@ -343,7 +343,7 @@ def _fit_gripper(draft: Draft) -> FittedGripper:
         fingertips = find_fingertips(draft.cell(gripper=config), arm.tip, is_one=True)
     config = config.model_copy(update={"open": round(fingertips.opening, 5)})
     cell = draft.cell(gripper=config)
-    # HomePose is not known yet, so let the fingers settle without contacts with the rest of the arm.
+    # Home is not known yet, so let the fingers settle without contacts with the rest of the arm.
     is_gripper = np.isin(np.arange(cell.model.ngeom), cell.gripper_geoms)
     cell.model.geom_contype *= is_gripper
     cell.model.geom_conaffinity *= is_gripper
