@@ -259,7 +259,7 @@ def test_a_run_of_either_rack_is_continued_without_the_other(
     report = json.loads(done.stdout)
     for own, other in ((report, f"{rack_name}-servo"), (report["others"][0], rack_name)):
         digest, said = repeated(tmp_path / own["folder"], tmp_path / f"without {other}")
-        assert f"not started: '{other}'; what they sent enters again" in said
+        assert f"not started: '{other}'; their recorded messages are replayed" in said
         assert digest == own["digest"]
         assert "are not as recorded" not in said
 

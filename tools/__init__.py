@@ -1,1 +1,1 @@
-"""The commands, and what they need: recording, timing, faults, viewer, network, lab."""
+"""The commands of `rack` and the libraries behind them."""

@@ -1,7 +1,7 @@
-"""The `rack` command line. A command's module is imported only when that command runs or shows its
-help.
+"""The `rack` command line.
 
-The parser, typer, takes long to import: `rack run` starts its crate before it.
+A command's module is imported only when that command runs or shows its help. The parser, typer,
+takes long to import, so `rack run` starts its crate first.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ COMMANDS = {
         "run": "Run a rack until its task ends, and report on the run.",
         "stop": "End a run and wait until it is gone.",
         "pause": "Pause a rack, or the motion of its arm.",
-        "resume": "Let a paused rack go on.",
-        "step": "Let a rack in lockstep go on by single cycles.",
+        "resume": "Let a paused rack continue.",
+        "step": "Advance a rack in lockstep by single cycles.",
         "rewind": "Go back to any tick of a recorded run, and branch off.",
         "list": "List the racks on this machine.",
         "clean": "Remove the shared memory that killed racks left behind.",
@@ -40,10 +40,10 @@ COMMANDS = {
     "Watch": {
         "status": "Show a running rack once.",
         "top": "Watch a running rack until its end.",
-        "watch": "Show signals of a running rack, or what was around a moment.",
-        "mailbox": "Show what is in a mailbox of a running rack.",
+        "watch": "Plot live signals, or capture a window around a trigger.",
+        "mailbox": "Show the newest message in a mailbox of a running rack.",
         "record": "Record a running rack.",
-        "replay": "Open recordings in the viewer, of several racks on one time line.",
+        "replay": "Open recordings in the viewer, several racks on one time line.",
         "export": "Write a recorded run as an MCAP file.",
         "report": "Report on a recorded run, or compare two runs.",
     },
@@ -75,7 +75,7 @@ COMMANDS = {
         "schema": "Show the keys of a config with their units and defaults.",
     },
 }
-"""All commands with one line of help, by what one would do with them."""
+"""All commands with one line of help, grouped by purpose."""
 SOURCES = {
     "resume": "rack.tools.commands.pause:resume",
     "list": "rack.tools.commands.list:list_racks",
@@ -84,12 +84,14 @@ SOURCES = {
     "robot": "rack.tools.commands.robot:app",
     "lan": "rack.tools.network.group:app",
 }
-"""Where a command is, a function or a `typer.Typer`, as "module:attribute". Any other one is the
-function of its name in the module of its name."""
+"""Places of commands as "module:attribute", each a function or a `typer.Typer`.
+
+Any other command is the function of its name in the module of its name.
+"""
 MAX_ARGUMENT = 4096
-"""Characters, as in the longest path; longer values belong in the config file."""
+"""Maximum number of characters, as in the longest path. Longer values belong in the config file."""
 COMPLETION = "_RACK_COMPLETE"
-"""Set by a shell that asks for the completion of a command line."""
+"""Environment variable of a shell that asks for the completion of a command line."""
 USAGE = (
     errno.ENAMETOOLONG,
     errno.ENOENT,
@@ -99,24 +101,24 @@ USAGE = (
     errno.ELOOP,
     errno.EACCES,
 )
-"""Errors of the system that mean that the user gave a wrong path."""
+"""System errors that mean that the user gave a wrong path."""
 
 
 def main() -> None:
-    """Run the command line; an error of the user is one line."""
+    """Run the command line. A mistake of the user is reported in one line."""
     if sys.platform != "linux":
         sys.exit(
             f"rack runs only on Linux, not on {sys.platform}: it needs /dev/shm, pidfds and"
             " SCHED_FIFO"
         )
-    # First of all: importing what a command needs takes longer than many a command.
+    # Handle signals before anything else: imports take longer than many commands.
     INTERRUPT.catch()
     _open_closed_streams()
     try:
         try:
             run_commands()
         except OSError:
-            # Of stdout, if that fails once more.
+            # If the error was one of stdout, this reports it.
             _flush("\n")
             raise
         finally:
@@ -128,24 +130,26 @@ def main() -> None:
 
 
 class ClosedInput(TextIOBase):
-    """A stdin that was closed before the start."""
+    """A stdin that was closed before the program started."""
 
     def fileno(self) -> int:
-        """Return the descriptor, which is always readable."""
+        """Return a descriptor that is always readable."""
         return 0
 
     def readline(self, size: int | None = -1, /) -> str:  # type: ignore[override]
-        """Raise `Failure`."""
+        """Raise `Failure`, because there is no input."""
         from rack.tools.console.answer import Failure
 
         raise Failure("stdin is closed, and this command reads from it", 2)
 
 
 def _open_closed_streams() -> None:
-    """Give closed standard streams their descriptors back: the next file that is opened would get
-    one, and what is printed.
+    """Open closed standard streams on /dev/null.
+
+    Otherwise the next file to be opened would get such a descriptor, and everything that is
+    printed.
     """
-    # The lowest free descriptor is that of the first closed stream.
+    # `os.open` returns the lowest free descriptor: the one that the first closed stream had.
     if sys.stdin is None:
         os.open(os.devnull, os.O_RDONLY)
         sys.stdin = ClosedInput()
@@ -170,7 +174,7 @@ def run_commands() -> None:
     except OSError as error:
         _fail_on_system_error(error)
     except Exception as error:
-        # The parser's own, of a wrong usage; it is not imported for this.
+        # Usage errors of the parser have `show`. Their class is not imported just for this.
         if not hasattr(error, "show"):
             raise
         error.show(usage := StringIO())
@@ -178,7 +182,10 @@ def run_commands() -> None:
 
 
 def _fail_on_system_error(error: OSError) -> NoReturn:
-    """End with the system's reason in one line. Raises `error` again if it is nobody's input."""
+    """Exit with the reason of a system error in one line.
+
+    Raises it again if no input explains it.
+    """
     from rack.backplane.process import refusal
     from rack.boards.errors import shown
     from rack.tools.console.answer import fail
@@ -194,21 +201,22 @@ def _fail_on_system_error(error: OSError) -> NoReturn:
 
 
 def _flush(text: str = "") -> None:
-    """Print what is still buffered, and this."""
+    """Print a text and everything that is still buffered."""
     try:
         print(end=text, flush=True)
     except OSError as error:
-        # Once more, when the interpreter ends, it would be a traceback.
+        # Otherwise the flush at the end of the interpreter would fail with a traceback.
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-        # A reader that has seen enough needs no message.
+        # A reader that has closed the pipe needs no message.
         if error.errno != errno.EPIPE:
             print(f"stdout: {error.strerror}", file=sys.stderr)
         sys.exit(1)
 
 
 def _head_start(arguments: Sequence[str]) -> AbstractContextManager[CrateLine | None]:
-    """Start the crate of `rack run`, which imports on the other core what takes longest; no other
-    command has one.
+    """Start the crate of `rack run`, whose slow imports then run on another core.
+
+    Other commands get an empty context.
     """
     if (
         arguments[:1] != ["run"]
@@ -220,11 +228,13 @@ def _head_start(arguments: Sequence[str]) -> AbstractContextManager[CrateLine | 
     from rack.boards.crate.line import NO_WINDOWS, SINGLE_THREADED, CrateLine, WarmCrate
 
     os.environ.update(SINGLE_THREADED | NO_WINDOWS)
-    return WarmCrate() if any(one.startswith("--from") for one in arguments) else CrateLine()
+    return (
+        WarmCrate() if any(argument.startswith("--from") for argument in arguments) else CrateLine()
+    )
 
 
 def commands() -> TyperGroup:
-    """Return the command line; its commands are loaded when they are used."""
+    """Build the command line. Its commands are loaded when they are used."""
     import typer
     from typer.core import TyperCommand, TyperGroup
 
@@ -233,15 +243,17 @@ def commands() -> TyperGroup:
 
         def format_commands(self, ctx: Any, formatter: Any) -> None:
             """Write a table of the commands for each group."""
-            for group, found in COMMANDS.items():
+            for group, group_commands in COMMANDS.items():
                 with formatter.section(group):
-                    formatter.write_dl([(f"{name:9}", line) for name, line in found.items()])
+                    formatter.write_dl(
+                        [(f"{name:9}", line) for name, line in group_commands.items()]
+                    )
 
     class LazyCommand(TyperCommand):
-        """A command of which only the name and one line of help are known."""
+        """A command that is loaded on use. Until then only its name and line of help are known."""
 
         def make_context(self, *given: Any, **named: Any) -> Any:
-            """Load the command; from here on it takes this one's place."""
+            """Load the command, which replaces this object."""
             return _loaded(str(self.name)).make_context(*given, **named)
 
     def show_version(is_asked: bool) -> None:
@@ -260,7 +272,7 @@ def commands() -> TyperGroup:
             is_eager=True,
         ),
     ) -> None:
-        """Take the options that stand before a command."""
+        """Declare the options before a command."""
 
     app = _app(
         cls=Grouped,
@@ -277,45 +289,48 @@ def commands() -> TyperGroup:
     app.callback()(rack)
     group = typer.main.get_command(app)
     assert isinstance(group, TyperGroup), "it has a callback"
-    for name, line in chain.from_iterable(found.items() for found in COMMANDS.values()):
+    for name, line in chain.from_iterable(
+        group_commands.items() for group_commands in COMMANDS.values()
+    ):
         group.add_command(LazyCommand(name, short_help=line))
     return group
 
 
 def _app(add_completion: bool = False, **settings: Any) -> typer.Typer:
+    """Create a typer application with plain-text help."""
     import typer
 
     return typer.Typer(add_completion=add_completion, rich_markup_mode=None, **settings)
 
 
 def _loaded(name: str) -> Any:
-    """Import a command."""
+    """Import a command by its name."""
     import typer
 
     source = SOURCES.get(name, f"rack.tools.commands.{name}:{name}")
     path, _, attribute = source.partition(":")
-    found = getattr(import_module(path), attribute)
-    if not isinstance(found, typer.Typer):
+    command = getattr(import_module(path), attribute)
+    if not isinstance(command, typer.Typer):
         app = _app()
-        app.command(name)(found)
-        found = app
-    return typer.main.get_command(found)
+        app.command(name)(command)
+        command = app
+    return typer.main.get_command(command)
 
 
 def _check_arguments(arguments: list[str]) -> None:
-    """Refuse arguments that no command can use. Raises `Failure`."""
+    """Reject arguments that no command can use. Raises `Failure`."""
     from rack.boards.errors import shown
     from rack.tools.console.answer import Failure
 
     for at, argument in enumerate(arguments, 1):
         if len(argument) > MAX_ARGUMENT:
             raise Failure(
-                f"argument {at} = {shown(argument)}: {len(argument)} characters; at most"
-                f" {MAX_ARGUMENT}",
+                f"argument {at} = {shown(argument)}: has {len(argument)} characters; must be at"
+                f" most {MAX_ARGUMENT}",
                 2,
             )
         if any("\ud800" <= c <= "\udfff" for c in argument):
-            raise Failure(f"argument {at} = {shown(argument)}: not UTF-8", 2)
+            raise Failure(f"argument {at} = {shown(argument)}: must be UTF-8", 2)
 
 
 if __name__ == "__main__":

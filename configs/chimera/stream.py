@@ -1,5 +1,4 @@
-"""Streams motions from the command environment: it draws a flower in the air, then puts one block
-on another.
+"""Streams motions from the command environment: a flower in the air, then one block on another.
 
 The rack runs it as its host board `command`. By hand, at any time:
     rack run chimera --set host.command.external=true

@@ -1,8 +1,7 @@
-"""The programming side: verbs that start motions on the real-time side, and a new verb combined
-from two of them.
+"""The programming side: verbs that start motions on the real-time side.
 
-`guarded_line` combines a line and a guard without changing either. The guard travels with the
-request of the line.
+A new verb, `guarded_line`, combines a line and a guard without changing either. The guard travels
+with the request of the line.
 """
 
 from collections.abc import Sequence
@@ -23,14 +22,23 @@ SLOW = 0.03
 
 
 def guarded_line(motions: Motions, goal: Sequence[float], seconds: float) -> bool:
-    """Move the tool along a line until the arm touches something; return whether it did."""
+    """Move the tool along a line until the arm touches something.
+
+    Args:
+        motions: The verbs.
+        goal: End of the line, (3,), m.
+        seconds: Duration of the whole line.
+
+    Returns:
+        True if the arm touched something.
+    """
     line = motions.line(goal, guard=PRESSED, segment=seconds)
     motions.wait(line)
     return motions.end_of(line) is RequestEnd.GUARDED
 
 
 class Assembly(HostProgram):
-    """Puts a block on the table, and the other on top of it. Heights are found by touch."""
+    """Puts one block on the table and another on top of it. Heights are found by touch."""
 
     motion = ProgramInput(MotionStatus, "below.motion")
     sensors = ProgramInput(ArmStatus, "below.sensors")
@@ -43,12 +51,13 @@ class Assembly(HostProgram):
             self._fetch(motions, block)
             touched = self._lower(motions)
             motions.wait(motions.release())
-            found = "touched at" if touched else "no touch down to"
-            print(f"{block}: {found} {motions.where()[2]:.4f} m")
+            result = "touched at" if touched else "no touch down to"
+            print(f"{block}: {result} {motions.where()[2]:.4f} m")
             motions.wait(motions.line((*PLACE, 0.70)))
         motions.wait(motions.move())
 
     def _fetch(self, motions: Motions, block: str) -> None:
+        """Grip a block and lift it. Raises `RuntimeError` if the gripper closes on nothing."""
         motions.release()
         motions.line((0.0, 0.0, 0.15), body=block)
         motions.line((0.0, 0.0, 0.0), body=block)
@@ -59,6 +68,7 @@ class Assembly(HostProgram):
         motions.wait(motions.line((0.0, 0.0, 0.20), body=block))
 
     def _lower(self, motions: Motions) -> bool:
+        """Lower the block until it touches something, and return whether it did."""
         above = (*PLACE, 0.62)
         below = (*PLACE, 0.44)
         motions.wait(motions.line(above))

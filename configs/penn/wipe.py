@@ -1,9 +1,9 @@
-"""Wipes across a surface with constant force, over a step that the script does not know, to a wall
-and back.
+"""Wipes across a surface with constant force, over an unknown step, to a wall and back.
 
 The rack runs this script as its host board `coordinator`. If the wipe fails, the script ends with
-an error, and the run with status 1. By hand, at any time: rack run penn --set
-host.coordinator.external=true rack prompt penn coordinator configs/penn/wipe.py
+an error, and the run with status 1. By hand, at any time:
+    rack run penn --set host.coordinator.external=true
+    rack prompt penn coordinator configs/penn/wipe.py
 """
 
 from rack.levels.systems.trajectory.messages import RequestEnd
@@ -16,38 +16,56 @@ START = -0.25  # m, along y, as are END and BEYOND
 END = 0.12
 BEYOND = 0.30  # behind the wall
 PRESS = 15.0  # N
-STEP = 0.002  # m: the force is judged once per step of the way
+STEP = 0.002  # m: distance between two checks of the force
 
 
 def expect(request, end, what):
-    """Wait for a request, and raise an error unless it ended with `end`."""
+    """Wait for a request, and check how it ended.
+
+    Args:
+        request: The request.
+        end: The expected end.
+        what: Name of the step, for the error.
+
+    Raises:
+        RuntimeError: The request ended differently.
+    """
     wait(request)
     if end_of(request) is not end:
         raise RuntimeError(f"{what}: {end_of(request).name.lower()}, not {end.name.lower()}")
 
 
 def wipe(y, seconds, end, what):
-    """Press while moving along the surface to y; raise an error if the force was wrong on more than
-    a fifth of the way.
+    """Press while moving along the surface to y.
+
+    Args:
+        y: Goal, m.
+        seconds: Duration of the motion.
+        end: The expected end.
+        what: Name of the step, for the error.
+
+    Raises:
+        RuntimeError: The force was wrong on more than a fifth of the way, or the end differs.
     """
     pressed = {}
 
-    def look():
-        place = round(where()[1] / STEP)
-        pressed[place] = abs(wrench()["z"] - PRESS) < 0.3 * PRESS
+    def check_force():
+        position_step = round(where()[1] / STEP)
+        pressed[position_step] = abs(wrench()["z"] - PRESS) < 0.3 * PRESS
         return False
 
     request = line((X, y, SURFACE), DOWN, segment=seconds)
-    wait(request, until=look)
+    wait(request, until=check_force)
     expect(request, end, what)
-    kept = sum(pressed.values()) / len(pressed)
-    if kept < 0.8:
-        raise RuntimeError(f"{what}: the force was wrong on {1 - kept:.0%} of the way")
+    good_fraction = sum(pressed.values()) / len(pressed)
+    if good_fraction < 0.8:
+        raise RuntimeError(f"{what}: the force was wrong on {1 - good_fraction:.0%} of the way")
 
 
 expect(free(), RequestEnd.DONE, "beginning")
 x, y, _ = where()
-line((x, y, ABOVE), DOWN)  # after a former process the tool may be anywhere
+# An earlier process may have left the tool anywhere, so lift it first.
+line((x, y, ABOVE), DOWN)
 line((X, START, ABOVE), DOWN)
 guard("touch")
 expect(

@@ -1,5 +1,4 @@
-"""The `rack` command line within the test's own process: without a second of imports for every
-call."""
+"""Runs the `rack` command line inside the test process, which saves a second of imports."""
 
 from __future__ import annotations
 
@@ -18,8 +17,7 @@ runs."""
 
 
 def rack(*arguments: object, folder: Path = ROOT) -> subprocess.CompletedProcess[str]:
-    """Run a command from a folder, the project's unless given; return what a process would have
-    left."""
+    """Run a command from a folder, by default the project's, and return a completed process."""
     before, out, err, status = sys.argv, StringIO(), StringIO(), 0
     sys.argv = ["rack", *map(str, arguments)]
     try:

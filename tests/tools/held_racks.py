@@ -1,4 +1,4 @@
-"""A rack that counts, run by a command in lockstep and held before tick 0."""
+"""A counting rack, run by a command in lockstep and held before tick 0."""
 
 from __future__ import annotations
 
@@ -18,8 +18,7 @@ from tests.tools.command_line import BOUND_S, ROOT, rack
 def held_rack(
     folder: Path, name: str, *options: str | Path
 ) -> Iterator[tuple[subprocess.Popen[bytes], Segment]]:
-    """Run a rack, without a recording unless `options` say otherwise; yield its launcher and its
-    memory."""
+    """Run a rack, by default without a recording, and yield its launcher and its segment."""
     path = folder / "counting.toml"
     path.write_text(counting(folder))
     words = ("--lockstep", "--step", "--set", f"name={name}", *(options or ("--no-record",)))

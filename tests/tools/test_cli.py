@@ -1,5 +1,4 @@
-"""The command line before any command: arguments that none can use, paths that cannot be,
-completion by the shell."""
+"""Tests the command line before any command: unusable arguments and paths, shell completion."""
 
 from __future__ import annotations
 
@@ -47,7 +46,7 @@ def test_an_argument_without_end_is_refused_in_one_line(arguments: tuple[str, ..
     done = rack(*arguments)
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.startswith("argument ")
-    assert done.stderr.endswith(" characters; at most 4096\n")
+    assert done.stderr.endswith(" characters; must be at most 4096\n")
     assert len(done.stderr) < 200
 
 
@@ -62,7 +61,7 @@ def test_a_name_that_no_file_can_have_is_refused_in_one_line(arguments: tuple[st
 
 
 @pytest.mark.parametrize("seconds", ["inf", "nan", "1e300", "-1"])
-def test_no_run_lasts_for_ever_or_less_than_nothing(seconds: str) -> None:
+def test_an_infinite_or_negative_duration_of_a_run_is_refused(seconds: str) -> None:
     done = rack("run", "fig2", "--lockstep", "--no-record", "--seconds", seconds)
     assert (done.returncode, done.stdout) == (2, "")
     assert "Invalid value for '--seconds'" in done.stderr
@@ -79,7 +78,7 @@ def test_a_usage_error_of_any_command_is_a_document_under_json(command: str) -> 
 
 
 def outputs(small: Path, rack_name: str) -> list[tuple[str, ...]]:
-    """Return command lines that print, in each of the ways in which there are."""
+    """Return command lines that print, one for each way of printing."""
     run = ("run", str(small), "--set", f"name={rack_name}", "--seconds", "0.1", "--no-record")
     return [("list",), ("check", "fig2", "--json"), ("status", rack_name, "--json"), run]
 
@@ -100,7 +99,7 @@ def printed_to(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("unbuffered", ["", "1"])
-def test_output_that_cannot_be_printed_is_one_line_and_a_reader_that_has_gone_is_no_error(
+def test_failed_output_is_reported_in_one_line_and_a_closed_pipe_is_no_error(
     small: Path, rack_name: str, unbuffered: str
 ) -> None:
     for arguments in [*outputs(small, rack_name), ("report", "--help")]:
@@ -157,14 +156,14 @@ def test_with_stdout_closed_commands_do_what_they_do(small: Path, rack_name: str
 
 
 @pytest.mark.parametrize("command", ["status", "stop", "record", "estop", "command", "inject"])
-def test_an_empty_name_is_no_rack_and_one_that_is_not_there_is_named(
+def test_an_empty_name_is_refused_and_an_unknown_rack_is_named(
     command: str, rack_name: str
 ) -> None:
     rest = {"command": ("upper", "hold"), "inject": ("wave", "kill")}.get(command, ())
     done = rack(command, "", *rest)
-    permitted = 'permitted: a running rack by name, as "rack list" shows it'
+    permitted = 'must be the name of a running rack, as "rack list" shows it'
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == f'RACK = "": empty; {permitted}\n'
+    assert done.stderr == f'RACK = "": {permitted}\n'
     done = rack(command, rack_name, *rest)
     assert (done.returncode, done.stdout) == (1, "")
     assert f"rack '{rack_name}' does not exist" in done.stderr
@@ -173,7 +172,7 @@ def test_an_empty_name_is_no_rack_and_one_that_is_not_there_is_named(
 @pytest.mark.parametrize(
     "option", ["--faultless=nan", "--faultless=inf", "--faultless=-1", "--seconds=inf"]
 )
-def test_no_campaign_lasts_for_ever_or_less_than_nothing(option: str) -> None:
+def test_an_infinite_or_negative_duration_of_a_campaign_is_refused(option: str) -> None:
     done = rack("campaign", "fig2", option)
     assert (done.returncode, done.stdout) == (2, "")
     assert f"Invalid value for '{option.partition('=')[0]}'" in done.stderr
@@ -188,14 +187,14 @@ def test_help_has_a_whole_line_for_every_command_by_groups() -> None:
     assert "".join(listed.split()) in "".join(rack("--help").stdout.split())
 
 
-def test_the_version_is_that_of_the_project() -> None:
+def test_the_printed_version_equals_the_version_of_the_project() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert rack("--version").stdout == f"rack {project['version']}\n"
 
 
-def test_bytes_that_are_no_text_are_refused() -> None:
+def test_bytes_that_are_not_utf_8_are_refused() -> None:
     done = run_process([*RACK, "check", b"\xff"])
-    assert (done.returncode, done.stderr) == (2, 'argument 2 = "?": not UTF-8\n')
+    assert (done.returncode, done.stderr) == (2, 'argument 2 = "?": must be UTF-8\n')
 
 
 @pytest.mark.slow

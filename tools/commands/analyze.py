@@ -1,4 +1,4 @@
-"""`rack analyze`: a run compared with the timing model."""
+"""`rack analyze`: compare a run with the timing model."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def analyze(
     run: RunFolder,
     percentile: float = option(
         "--percentile P",
-        "judge by the longest of P in 100 cycles, as in 99.9; 100: of all cycles, as in eq. 3.6",
+        "judge by the longest of P in 100 cycles, as in 99.9; by default of all, as in eq. 3.6",
         100.0,
         min=1.0,
         max=100.0,
@@ -31,16 +31,16 @@ def analyze(
     verbose: bool = option("--verbose", "add the tables of levels, tasks and equations", False),
     as_json: Json = False,
 ) -> None:
-    r"""Compare a run with the timing model: every equation that `rack check` predicts, with its
-    measurement.
+    r"""Compare a run with the timing model, equation by equation.
 
-    Times of levels are processor time, without waiting and preemption. A virtual machine stalled by
-    its host counts the stall as processor time: cycles in which one is seen are not judged. Not
-    every one is seen; --percentile 99 leaves out whatever happens less than once in 100 cycles.
+    Each equation that `rack check` predicts is shown with its measurement. Times of levels are
+    processor time, without waiting and preemption. A virtual machine stalled by its host counts the
+    stall as processor time. Cycles with a detected stall are not judged. Some stalls go undetected:
+    --percentile 99 leaves out whatever happens less than once in 100 cycles.
 
-    It says how the run ended, what held, what was tightest, and what to do. --verbose adds every
-    level, task and equation. It writes analysis.json. `rack gantt RUN` shows which tasks had a
-    core.
+    The answer tells how the run ended, which equations held, which was tightest, and what to do.
+    --verbose adds every level, task and equation. The command writes analysis.json. `rack gantt
+    RUN` shows which tasks had a core.
 
     Exit status: 0 every equation held; 1 one failed; 2 the run cannot be analyzed.
 
@@ -56,12 +56,12 @@ def analyze(
         return
     progress = reading_progress(silent=as_json)
     analysis = Analysis.of(Recording(run), percentile, progress)
-    found = document(analysis)
+    analysis_document = document(analysis)
     progress(0.9)
     folder.mkdir(parents=True, exist_ok=True)
-    write_json(folder / "analysis.json", found)
+    write_json(folder / "analysis.json", analysis_document)
     if as_json:
-        print_json(found)
+        print_json(analysis_document)
     else:
         print_blocks((*analysis_blocks(analysis, verbose), "", f"{folder}/analysis.json"))
     if not analysis.holds:

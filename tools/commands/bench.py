@@ -22,12 +22,15 @@ Config = Annotated[
 ]
 Against = Annotated[
     Path | None,
-    typer.Option(metavar="TREE", help="another checkout of rack, measured by turns with this one"),
+    typer.Option(
+        metavar="TREE", help="another checkout of rack, measured alternately with this one"
+    ),
 ]
 Share = Annotated[
     bool,
     typer.Option(
-        "--share", help="run even on cores held by another rack's real-time boards: figures suffer"
+        "--share",
+        help="run even on cores of another rack's real-time boards, at the price of worse figures",
     ),
 ]
 Rounds = Annotated[
@@ -40,7 +43,8 @@ bench = typer.Typer(add_completion=False, no_args_is_help=True, rich_markup_mode
 @bench.callback()
 def interruptible(context: typer.Context) -> None:
     """Measure costs on this machine."""
-    context.with_resource(INTERRUPT.raising())  # so that temporary folders are removed, too
+    # Raise an exception on a signal, so that temporary folders are removed.
+    context.with_resource(INTERRUPT.raising())
 
 
 @bench.command()
@@ -56,17 +60,17 @@ def machine(
 ) -> None:
     r"""Is this machine fit for real time, and up to which rate?
 
-    The fastest board of a rack runs at each rate in turn; the other levels keep their rates. By
-    turns with it, `cyclictest` of rt-tests sleeps to the same grid on the same core: no board can
-    wake earlier. A rate is held if `cyclictest` is late by a cycle in at most 0.1 % of its wakes,
-    and the board misses at most 0.1 % of its cycles beyond that share. Without SCHED_FIFO (see
+    The fastest board of a rack runs at each rate in turn. The other levels keep their rates.
+    Between these runs `cyclictest` of rt-tests sleeps to the same grid on the same core: no board
+    can wake earlier. A rate is held if `cyclictest` is late by a cycle in at most 0.1 % of its
+    wakes, and the board misses at most 0.1 % of its cycles in addition. Without SCHED_FIFO (see
     `ulimit -r`) no machine is fit.
 
     Lateness is the time from grid point to start. As root the rack also runs with idle cores held
-    awake, and the last line says which `clock.idle_cores` suits this machine. It takes about four
-    minutes; let nothing else run meanwhile.
+    awake, and the last line recommends a value of `clock.idle_cores` for this machine. The bench
+    takes about four minutes. Run nothing else during this time.
 
-    Exit status: 0 fit at the lowest rate at least; 1 not fit, or a run failed; 2 a bad config.
+    Exit status: 0 fit at least at the lowest rate; 1 not fit, or a run failed; 2 a bad config.
 
     \b
     Examples:
@@ -76,8 +80,10 @@ def machine(
     from rack.tools.lab.benches.machine import RATES_HZ, measure
 
     rates = rate or RATES_HZ
-    found = show(lambda progress: measure(config, rates, seconds, rounds, share, progress), as_json)
-    if not found.is_fit:
+    verdict = show(
+        lambda progress: measure(config, rates, seconds, rounds, share, progress), as_json
+    )
+    if not verdict.is_fit:
         raise typer.Exit(1)
 
 
@@ -86,10 +92,10 @@ def mailbox(
     rounds: int = option("--rounds N", "turns of every contestant", 200, min=1),
     as_json: Json = False,
 ) -> None:
-    """What does a message cost, next to iceoryx2, HORUS and pipes?
+    """Measure the cost of a message, next to iceoryx2, HORUS and pipes.
 
-    Messages of 64 B to 16 kB, one reader and four, by every protocol, by turns with iceoryx2,
-    HORUS and pipes of multiprocessing. The ratio is to the best of these peers.
+    Messages of 64 B to 16 kB are sent to one reader and to four, by every protocol, alternately
+    with iceoryx2, HORUS and pipes of multiprocessing. The ratio is to the best of these peers.
     """
     from rack.tools.lab.benches.mailbox import CASES, measure
 
@@ -104,12 +110,12 @@ def cycle(
     share: Share = False,
     as_json: Json = False,
 ) -> None:
-    """What does a board's cycle cost, part by part?
+    """Measure the cost of a board's cycle, part by part.
 
-    Boards that compute nothing, and each board of nasrem, in real time and in lockstep, by turns
-    with another checkout. Without one, the servo board in lockstep is compared with bare mj_step
-    calls: the physics of its recorded run, replayed alone. TREE runs in its own environment,
-    TREE/.venv.
+    The bench runs boards that compute nothing, and each board of nasrem, in real time and in
+    lockstep, alternately with another checkout. Without a checkout, the servo board in lockstep is
+    compared with bare mj_step calls that replay the physics of its recorded run. TREE runs in its
+    environment TREE/.venv.
     """
     from rack.tools.lab.benches.cycle import measure
 
@@ -125,15 +131,18 @@ def lockstep(
     rounds: Rounds = 3,
     as_json: Json = False,
 ) -> None:
-    """How fast do nasrem, k1607 and fig4 run in lockstep?
+    """Measure the speed of nasrem, k1607 and fig4 in lockstep.
 
-    Next to them, by turns, the bare limit: the same plans and cycles of the same levels in one
-    process without a rack. Its messages must be those of the rack, bit for bit. Ratios are to TREE
-    if it is given, else to this limit. TREE runs in its own environment, TREE/.venv.
+    They run alternately with the lower bound: the same plans and cycles of the same levels in one
+    process without a rack, whose messages must equal the rack's bit for bit. Ratios are to TREE if
+    it is given, and to this bound otherwise. TREE runs in its environment TREE/.venv.
     """
     from rack.tools.lab.benches.lockstep import RACKS, measure
 
-    racks = {name: min(filter(None, (own, seconds)), default=None) for name, own in RACKS.items()}
+    racks = {
+        name: min(filter(None, (default_s, seconds)), default=None)
+        for name, default_s in RACKS.items()
+    }
     show(lambda progress: measure(against, racks, rounds, progress), as_json)
 
 
@@ -146,13 +155,13 @@ def launch(
     share: Share = False,
     as_json: Json = False,
 ) -> None:
-    """How long do launches, commands and reactions take?
+    """Measure the duration of launches, commands and reactions.
 
     A launch is the time from `rack run` to the first cycle of the fastest level; its ratio is to
-    the checkout given by --against. The ratio of a short command is to a Python that imports numpy
-    and ends. `rack report` shows a report that the run has made. Then the board that drives the arm
-    of a running rack is killed again and again: the output shows the time to detection, and the
-    time until the brakes of the arm are engaged.
+    the checkout given by --against. The ratio of a short command is to a Python that only imports
+    numpy. `rack report` shows a report that the run has made. Then the board that drives the arm of
+    a running rack is killed repeatedly: the output shows the time to detection, and the time until
+    the brakes of the arm are engaged.
     """
     from rack.tools.lab.benches.launch import measure
 

@@ -1,6 +1,4 @@
-"""`rack campaign`: inject random faults of all kinds, and report detection, reaction and
-recovery.
-"""
+"""`rack campaign`: inject random faults of all kinds, and judge detection and recovery."""
 
 from __future__ import annotations
 
@@ -20,37 +18,37 @@ if TYPE_CHECKING:
 INJECTIONS = 3
 SIZES = 10
 FAULTLESS_S = 60.0
-NO_TIME = "no time for the report: 'rack campaign' with --out {} goes on from here"
+NO_TIME = "no time for the report: 'rack campaign' with --out {} continues from here"
 MOST = 100_000
-"""Faults of a kind, kills or sizes of one campaign."""
+"""Upper bound for injections of a kind, kills and sizes of one campaign."""
 
 
 def campaign(
     config: ConfigName,
     injections: int = option(
-        "--injections N", "strikes of each kind, at least", INJECTIONS, min=0, max=MOST
+        "--injections N", "minimum number of injections of each kind", INJECTIONS, min=0, max=MOST
     ),
     seed: int = option("--seed S", "seed; the same seed draws the same plans", 0, min=0),
     kinds: str | None = option(
-        "--kinds A,B", "only these kinds; default: all that the rack can have"
+        "--kinds A,B", "only these kinds; default: all kinds that apply to the rack"
     ),
     kills: int | None = option("--kills N", "instead: only N kills from outside", min=1, max=MOST),
     lockstep: bool = option("--lockstep", "trials in lockstep only; default: both", False),
     realtime: bool = option("--realtime", "trials in real time only; default: both", False),
     faultless: float | None = option(
         "--faultless S",
-        f"seconds without faults, alone and under load; default {FAULTLESS_S:g}",
+        f"seconds without faults, once alone and once under load; default {FAULTLESS_S:g}",
         min=0.0,
         max=1e6,
     ),
     load: bool = option(
-        "--load", "without faults: only under load, by stress-ng where installed", False
+        "--load", "run without faults only under load, made by stress-ng if installed", False
     ),
     sizes: int | None = option(
-        "--sizes N", f"sizes on each curve of size against delay; default {SIZES}", min=0, max=MOST
+        "--sizes N", f"points on each curve of size against delay; default {SIZES}", min=0, max=MOST
     ),
     seconds: float | None = option(
-        "--seconds S", "simulated seconds of a run, for a rack that no task ends", min=1.0, max=1e9
+        "--seconds S", "simulated seconds of a run, for a rack without a task", min=1.0, max=1e9
     ),
     settings: Settings = [],  # noqa: B006  typer copies it
     whole: bool = option(
@@ -65,16 +63,16 @@ def campaign(
 ) -> None:
     r"""Inject random faults of all kinds into runs of a rack, and judge each of them.
 
-    Each trial has as many faults as fit. Trials in lockstep run on all cores at once, others one
-    after the other. Until its first fault a trial is the faultless run: in lockstep it goes on from
-    a snapshot of that, and ends when the verdict on each of its faults is certain; --json says
-    which could not, and why. --whole runs each to the end of its task.
-    There are also runs without faults, in real time, alone and under load. The
-    same --out continues an interrupted campaign.
+    Each trial has as many faults as fit. Trials in lockstep run on all cores in parallel, others
+    one after the other. Up to its first fault a trial equals the faultless run. In lockstep it
+    therefore continues from a snapshot of that run, and ends when the verdict on each of its faults
+    is certain; --json lists the trials that could not, with reasons. --whole runs each to the end
+    of its task. There are also runs without faults in real time, alone and under load. The same
+    --out continues an interrupted campaign.
 
-    Exit status: 0 the campaign passed; 1 a fault did not strike, or was not found, reacted to and
-    recovered from in time; a limit was violated; something was left behind; a task was neither done
-    nor safely stopped; or a detection had no fault; 2 usage or config error.
+    Exit status: 0 the campaign passed; 1 a fault did not strike, or was not detected, handled and
+    recovered from in time; a limit was violated; a process or segment was left behind; a task was
+    neither done nor safely stopped; or a detection had no fault; 2 usage or config error.
 
     \b
     Examples:
@@ -90,21 +88,19 @@ def campaign(
 
     if lockstep and realtime:
         raise Failure(
-            "--lockstep and --realtime: they exclude each other; give one, or neither for both", 2
+            "--lockstep and --realtime exclude each other; give one, or neither for both", 2
         )
     if kills is not None and kinds is not None:
         raise Failure(
-            f"--kills {kills} and --kinds {kinds}: kills from outside are a kind of their own;"
-            " give one",
+            f"--kills {kills} and --kinds {kinds} exclude each other: kills from outside are not a"
+            " kind of fault; give one",
             2,
         )
-    found = load_config(config, settings)
-    if seconds is None and not any(board.ends_run for board in found.board.values()):
-        raise Failure(
-            f"{config}: no board ends the run: give --seconds, the simulated time of a run", 2
-        )
+    rack_config = load_config(config, settings)
+    if seconds is None and not any(board.ends_run for board in rack_config.board.values()):
+        raise Failure(f"{config}: no board ends the run; give its simulated time with --seconds", 2)
     if faultless is None:
-        # No faultless time in real time where only lockstep, or only kills, were ordered.
+        # Skip faultless runs in real time if the user wants only lockstep, or only kills.
         faultless = 0.0 if lockstep or kills is not None else FAULTLESS_S
     if kills:
         injections = 0
@@ -114,7 +110,7 @@ def campaign(
     loads = (True,) if load else (False, True)
     order = Order(
         name=config,
-        config=found,
+        config=rack_config,
         injections=injections,
         seed=seed,
         modes=modes,
@@ -125,23 +121,24 @@ def campaign(
         loads=loads,
         seconds=seconds,
     )
-    goes_on = out is not None and (out / ORDER).is_file()
     started = time.monotonic()
-    folder = out if out is not None and goes_on else folder_of(out, "campaign")
+    # An existing campaign is continued in its folder.
+    folder = out if out is not None and (out / ORDER).is_file() else folder_of(out, "campaign")
     with INTERRUPT.orderly(unfinished=NO_TIME.format(folder)):
         with progress_for(silent=as_json) as progress:
             work = Campaign(order, folder, progress, whole)
             results = work.run()
         report, text = _write(work, results, time.monotonic() - started)
-    lacking = "" if can_draw() else f"; {NO_PICTURES}"
-    print_json(report) if as_json else print(f"{text}\n{folder}/{lacking}")
+    picture_note = "" if can_draw() else f"; {NO_PICTURES}"
+    print_json(report) if as_json else print(f"{text}\n{folder}/{picture_note}")
     if report["shortfalls"] or report["interrupted"]:
         sys.exit(1)
 
 
 def _write(work: Campaign, results: Results, wall_s: float) -> tuple[dict[str, object], str]:
-    """Write campaign.json, campaign.md and, unless interrupted or without matplotlib, campaign.png;
-    return the first two.
+    """Write campaign.json, campaign.md and campaign.png, and return the first two.
+
+    The picture needs matplotlib, and is left out of an interrupted campaign.
     """
     from rack.tools.faults.campaigns.report import CampaignReport
 
@@ -151,7 +148,7 @@ def _write(work: Campaign, results: Results, wall_s: float) -> tuple[dict[str, o
     text = report.markdown()
     write_json(work.folder / "campaign.json", document)
     (work.folder / "campaign.md").write_text(text)
-    # An interrupted campaign has no time for it.
+    # Drawing takes too long for an interrupted campaign.
     if not results.is_interrupted and can_draw():
         from rack.tools.faults.campaigns.plot import plot
 

@@ -1,6 +1,4 @@
-"""`rack check`: validate a config, show its inventory, and predict whether its levels meet their
-cycles.
-"""
+"""`rack check`: validate a config, and predict whether its levels meet their cycles."""
 
 from __future__ import annotations
 
@@ -34,7 +32,7 @@ def check(
     settings: Settings = [],  # noqa: B006  typer copies it
     faults: Faults = None,
     run: Path | None = option(
-        "--from RUN", "use the budgets measured in this run, not the config's"
+        "--from RUN", "use the budgets measured in this run in place of the config's"
     ),
     percentile: float = option(
         "--percentile P",
@@ -48,37 +46,37 @@ def check(
     ),
     verbose: bool = option(
         "--verbose",
-        "add slots, mailboxes, every equation, and what an arm does while no torque comes",
+        "add slots, mailboxes, every equation, and the motion of an arm without new torques",
         False,
     ),
     as_json: Json = False,
 ) -> None:
     r"""Validate a config, and predict whether its levels meet their cycles.
 
-    It prints every mistake, one per line; or five lines: does the rack fit, where is it tightest,
-    how soon does it respond, what can its arm do at rest, and what to do. --verbose adds slots,
-    cores, rates, mailboxes with their bus addresses, and every equation. On a terminal the tables
-    show as many columns as fit; --json has all.
+    The command prints every mistake, one per line. A valid config gets five lines: whether the rack
+    fits, where it is tightest, how soon it responds, what its arm can do at rest, and what to do.
+    --verbose adds slots, cores, rates, mailboxes with their bus addresses, and every equation. On a
+    terminal the tables show as many columns as fit; --json has all.
 
-    The timing rests on budgets: the longest processor time of each part of a level's cycle. They
+    The prediction uses budgets: the longest processor time of each part of a level's cycle. They
     are in the config, in [board.<name>.budget], or measured, with --from RUN. [timing] has the
-    context switch, the clock's own time, the limit of eq. 3.10, and a goal for the system's
-    response. `rack schema board.budget` and `rack schema timing` show the keys.
+    context switch, the time of the clock itself, the limit of eq. 3.10, and a goal for the response
+    of the system. `rack schema board.budget` and `rack schema timing` show the keys.
 
     Equations 3.1 to 3.10 of the paper are applied to every level with a budget: both sides, the
     margin, and ok or FAILS. Beyond the paper, it computes the worst-case response time of every
     task, and the load of every core.
 
-    If something fails, it lists changes that help, cheapest first, each tried on the whole rack:
-    another priority or core, a board for the planner, older plans, or a longer cycle, of that board
-    or of one that shares its core. Changes that need a core that this machine lacks come last.
-    --fix prints the config with the first of them.
+    If an equation fails, the command lists changes that help, cheapest first, each tried on the
+    whole rack: another priority or core, a board for the planner, older plans, or a longer cycle,
+    for that board or for one that shares its core. Changes that need more cores than this machine
+    has come last. --fix prints the config with the first change.
 
-    The verdict names every board, planner and host board that was not counted: "fits" alone means
-    that all were. The recorder never is. In --json timing.fits is true, false, or null for a rack
-    that fits without what timing.uncounted lists.
+    The verdict names every board, planner and host board that was not counted. "fits" without names
+    means that all were counted, except the recorder. In --json timing.fits is true, false, or null
+    for a rack that fits without the boards in timing.uncounted.
 
-    Exit status: 0 every equation holds, of what was counted; 1 an equation fails, or no change
+    Exit status: 0 all equations hold for the counted boards; 1 an equation fails, or no change
     helps; 2 a bad config.
 
     \b
@@ -88,10 +86,10 @@ def check(
       rack check fig3 --fix > fits.toml
       rack check nasrem --from runs/nasrem-20250101-120000
     """
-    found = load(config, settings, faults)
+    rack_config = load(config, settings, faults)
     if run is not None:
-        found = _measured(found, run, percentile)
-    judged = JudgedConfig.of(found)
+        rack_config = _measured(rack_config, run, percentile)
+    judged = JudgedConfig.of(rack_config)
     if judged.failing and sys.stderr.isatty():
         print("the timing does not fit; looking for changes that help", file=sys.stderr)
     fitting = repair(judged)
@@ -100,32 +98,39 @@ def check(
         if fitting.left:
             sys.exit(1)
         return
-    lacking = shared_out(found)
-    stock = inventory(found, judged.layout, lacking)
-    forecast = Forecast.of(judged.timing, not lacking, found.host)
-    arm = _abilities(found)
+    core_warnings = shared_out(rack_config)
+    inventory_document = inventory(rack_config, judged.layout, core_warnings)
+    forecast = Forecast.of(judged.timing, not core_warnings, rack_config.host)
+    arm = _abilities(rack_config)
     if as_json:
         fits = (None if forecast.uncounted else True) if forecast.holds else False
         verdict = {"fits": fits, "uncounted": forecast.uncounted, "repair": fitting.document()}
         timing = forecast.document() | verdict
         arm_document = None if arm is None else asdict(arm)
-        further = {"changed": found.changed, "arm": arm_document}
-        print_json(stock | further | {"timing": timing})
+        extra = {"changed": rack_config.changed, "arm": arm_document}
+        print_json(inventory_document | extra | {"timing": timing})
     else:
-        again = shlex.join([config, *(f"--set={setting}" for setting in settings)])
-        measured = folder_of(None, found.name)
-        measuring = (
-            f"rack run {again} --seconds 10 --out {measured}; rack check {again} --from {measured}"
+        arguments_text = shlex.join([config, *(f"--set={setting}" for setting in settings)])
+        measured = folder_of(None, rack_config.name)
+        measure_hint = (
+            f"rack run {arguments_text} --seconds 10 --out {measured};"
+            f" rack check {arguments_text} --from {measured}"
         )
-        head, *rest = inventory_blocks(stock)
+        head, *rest = inventory_blocks(inventory_document)
         lines: list[str | TextTable] = [
             head,
-            *found.changed,
-            *lacking,
-            *summary_blocks(forecast, fitting, arm, found.joints, "" if run else measuring),
+            *rack_config.changed,
+            *core_warnings,
+            *summary_blocks(
+                forecast, fitting, arm, rack_config.joints, "" if run else measure_hint
+            ),
         ]
         if verbose:
-            lines += [*rest[len(lacking) :], *arm_lines(stock), *forecast_blocks(forecast)]
+            lines += [
+                *rest[len(core_warnings) :],
+                *arm_lines(inventory_document),
+                *forecast_blocks(forecast),
+            ]
         else:
             lines.append("--verbose shows every task, mailbox and equation")
         print_blocks(lines)
@@ -134,28 +139,31 @@ def check(
 
 
 def _measured(config: RackConfig, run: Path, percentile: float) -> RackConfig:
-    """Return a config with the budgets measured in a run. Raises `Failure` for a run of another
-    rack.
+    """Replace the budgets of a config by those measured in a run.
+
+    Raises `Failure` for a run of another rack.
     """
-    # Only --from needs them, and they take long to load.
+    # Import these only for --from, because they take long to load.
     from rack.tools.recording.cycles import measured_budgets
     from rack.tools.recording.recording import Recording
 
     recording = Recording(run)
-    ran = sorted({task.board for task in recording.layout.tasks})
-    asked = sorted(config.board)
-    if ran != asked:
+    run_boards = sorted({task.board for task in recording.layout.tasks})
+    config_boards = sorted(config.board)
+    if run_boards != config_boards:
         raise Failure(
-            f"{run}: a run of other boards: {', '.join(ran)}; '{config.name}' has"
-            f" {', '.join(asked)}",
+            f"{run}: its boards are {', '.join(run_boards)}, but those of '{config.name}' are"
+            f" {', '.join(config_boards)}",
             2,
         )
-    ran_as = rack_timing(recording.rack_config, recording.layout)
-    return with_budgets(config, without_interrupts(ran_as, measured_budgets(recording, percentile)))
+    run_timing = rack_timing(recording.rack_config, recording.layout)
+    return with_budgets(
+        config, without_interrupts(run_timing, measured_budgets(recording, percentile))
+    )
 
 
 def _abilities(config: RackConfig) -> Abilities | None:
-    """Return what the arm of a rack can do at rest; None for a hand, or without one."""
+    """Compute what the arm of a rack can do at rest. None for a hand, or without an arm."""
     robot = config.robot
     if robot is None or robot.hand is not None:
         return None
@@ -166,7 +174,7 @@ def _abilities(config: RackConfig) -> Abilities | None:
 
 
 def _print_fixed(fitting: Repair, as_json: bool) -> None:
-    """Print the config that fits on stdout, its changes on stderr."""
+    """Print the config that fits on stdout, and its changes on stderr."""
     config = None if fitting.left else fitting.end.config.text()
     if as_json:
         print_json(fitting.document() | {"config": config})

@@ -10,7 +10,7 @@ from rack.tools.console.parameters import Json
 def clean(as_json: Json = False) -> None:
     r"""Remove the shared memory that killed racks left behind.
 
-    It never touches a rack in use, nor a directory or symbolic link that only has the name of one.
+    A rack in use is never touched, nor is a directory or symbolic link with the name of a rack.
 
     \b
     Examples:

@@ -18,17 +18,17 @@ if TYPE_CHECKING:
     from rack.tools.monitor.replies import Reply
 
 Tick = Annotated[
-    int | None, typer.Option(metavar="T", help="tick at which it is given; default: the next one")
+    int | None, typer.Option(metavar="T", help="tick of the command; default: the next one")
 ]
 At = Annotated[
-    float | None, typer.Option(metavar="S", min=0.0, max=1e9, help="the same, in simulated seconds")
+    float | None, typer.Option(metavar="S", min=0.0, max=1e9, help="the same in simulated seconds")
 ]
 
 
 def command(
     rack: RackName,
     level: str | None = argument(
-        "LEVEL", "task, elemental_move, primitive, servo, or a level of your own", None
+        "LEVEL", "task, elemental_move, primitive, servo, or your own level", None
     ),
     what: str | None = argument(
         "WHAT", "hold, resume, setpoint, goto, enable, ...; see above", None
@@ -43,12 +43,12 @@ def command(
     tick: Tick = None,
     at: At = None,
     wait: bool = option(
-        "--wait", "wait until it is done: the arm is at rest, or at its goal", False
+        "--wait", "wait until the command is done: the arm is at rest, or at its goal", False
     ),
     timeout: Timeout = None,
     lease: bool = option(
         "--lease",
-        "stay while it is in force; where this command ends before, the level holds",
+        "stay while the command is in force; if this program ends first, the level holds",
         False,
     ),
     is_list: bool = option(
@@ -64,22 +64,22 @@ def command(
     setpoint  the same, at the servo level: a straight line in joint space,
               without checking for collisions
     resume    let the level continue its own work
-    modify    put a control modification of the servo level in, or take it out,
+    modify    switch a control modification of the servo level on or off,
               between two samples and without a step in the torque
     table     decide by another state table from now on
-    do        do one of the level's own commands, in place of the level above
+    do        give the level one of its own commands, in place of the level above
     set       set a live parameter of the level, as 'rack set' does
-    enable    ask the arm's drives for torque; the arm goes on from where it is
+    enable    ask the arm's drives for torque; the arm continues from its position
     disable   brake the arm, and take the torque from its drives
     reset     clear a fault of the arm's drives, which are then disabled
     release   end the bring-up of an arm: full speed from now on
 
-    `hold`, `setpoint`, `goto` and `do` stay in force until `resume`, and the mode of the level is
-    "operator", otherwise "automatic": see 'rack status'. They survive a restart of the level's
-    board. With --lease they are in force while this command lasts: Ctrl-C, a closed terminal or
-    SIGKILL make the level hold. --wait only watches: where it ends before, the command goes on. An
-    emergency stop takes precedence. On a rack that is held a command waits for the next step: it is
-    given then, and this returns at once.
+    `hold`, `setpoint`, `goto` and `do` stay in force until `resume`. Until then the mode of the
+    level in 'rack status' is "operator" instead of "automatic". They survive a restart of the
+    level's board. With --lease they stay in force as long as this program runs: Ctrl-C, a closed
+    terminal or SIGKILL make the level hold. --wait only watches: if it is interrupted, the command
+    stays in force. An emergency stop takes precedence. On a rack that is held between two ticks,
+    this program returns at once and the command takes effect at the next step.
 
     Exit status: 0 the level accepted the command, or with --wait completed it; 1 it refused or did
     not answer in time; 2 usage.
@@ -105,8 +105,8 @@ def command(
 
     check_timeout(timeout, wait)
     if lease and wait:
-        raise Failure("--lease, --wait: a lease stays anyway", 2)
-    # An exception, not an end at once, so that a command that has not been given yet is withdrawn.
+        raise Failure("--lease and --wait: a lease waits anyway; leave out --wait", 2)
+    # Raise an exception on a signal, so that a command that has not been given yet is withdrawn.
     with INTERRUPT.raising(), closing(Segment.attach(rack)) as segment:
         desk = LiveDesk(segment)
         if is_list:
@@ -116,18 +116,24 @@ def command(
             raise Failure(
                 f"LEVEL and WHAT are needed, as in: rack command {rack} task hold; or --list", 2
             )
-        given = {"level": level, "what": what, "tick": tick, "at": at, **goal_of(what, goal or [])}
+        request = {
+            "level": level,
+            "what": what,
+            "tick": tick,
+            "at": at,
+            **goal_of(what, goal or []),
+        }
         if lease:
-            desk.attend(given, partial(print_reply, as_json=as_json))
+            desk.attend(request, partial(print_reply, as_json=as_json))
             return
-        reply = desk.give(given, wait, timeout)
+        reply = desk.give(request, wait, timeout)
     print_reply(reply, as_json)
     if reply.is_standing and Operation[what.upper()] in EFFECTS and not as_json:
         print(f"in force until: {resume_command(rack, level)}")
 
 
 def print_reply(reply: Reply, as_json: bool) -> None:
-    """Print a level's reply at once; end the command with status 1 if the level refused."""
+    """Print the reply of a level at once. End the program with status 1 if the level refused."""
     print_answer(asdict(reply) | {"worked": reply.worked}, reply.line, as_json)
     sys.stdout.flush()
     if not reply.worked:

@@ -15,7 +15,7 @@ from rack.tools.console.held import waits
 from rack.tools.console.parameters import Json, argument, named, option, rack_names
 
 OBEY_S = 2.0
-"""Longest wait for the clock, which reads the latch every tick."""
+"""Longest wait until the clock, which reads the latch every tick, has obeyed."""
 
 
 def estop(
@@ -27,7 +27,7 @@ def estop(
     ),
     reset: bool = option("--reset", "clear the latch, so that the arm may move again", False),
     ready: bool = option(
-        "--ready", "for HOST/RACK: connect now, and set it when Enter is pressed", False
+        "--ready", "for HOST/RACK: connect now, and stop the rack when Enter is pressed", False
     ),
     certificates: str = option(
         "--certificates DIR",
@@ -43,13 +43,13 @@ def estop(
     r"""Engage the brakes of the arm at once, and keep them engaged until --reset.
 
     The run continues with the arm braked. The reset is refused while a board is lost, or SYSFAIL or
-    ACFAIL is asserted. On another machine's rack, HOST/RACK, those may set it whom its config names
-    in adapter.lan.estop_from; it is reset at the rack. Where strangers reach the port of a rack,
-    they can delay new connections: with --ready the connection is there before it is needed. It
-    says on stderr whenever that changes. Enter, or any line on stdin, sets the stop, at once or as
-    soon as the rack can be reached. Ctrl-C leaves without one.
+    ACFAIL is asserted. A rack on another machine, HOST/RACK, can be stopped by the operators whom
+    its config names in adapter.lan.estop_from. It must be reset on its own machine. Strangers who
+    reach the port of a rack can delay new connections; --ready therefore connects in advance, and
+    reports on stderr whenever the connection is lost or restored. Enter, or any line on stdin, sets
+    the stop at once, or as soon as the rack can be reached. Ctrl-C ends without a stop.
 
-    The arm of a rack that is held brakes when the rack goes on.
+    The arm of a rack that is held between two ticks brakes when the rack continues.
 
     Exit status: 0 the latch is set, or with --reset clear; 1 the reset was refused, or there is no
     such rack.
@@ -63,31 +63,44 @@ def estop(
     """
     if ready and (reset or "/" not in rack):
         other = "--reset" if reset else rack
-        raise Failure(f"--ready, {other}: it waits to stop a rack of another machine, HOST/RACK", 2)
+        raise Failure(
+            f"--ready, {other}: --ready only stops a rack on another machine, HOST/RACK", 2
+        )
     if "/" in rack:
         tick = _stop_from_afar(RackAddress.of(rack), reset, ready, Operator.of(name, certificates))
-        own = rack.partition("/")[2]
-        held = ""
+        rack_name = rack.partition("/")[2]
+        wait_reason = ""
     else:
-        tick, held = _latch(rack, reset)
-        own = rack
-    where = ", on its own machine" if own != rack else ""
+        tick, wait_reason = _latch(rack, reset)
+        rack_name = rack
+    where = ", on its own machine" if rack_name != rack else ""
     state = f"reset at tick {tick}" if reset else f"latched at tick {tick}"
-    if held:
-        state += f"; the arm {held}"
+    if wait_reason:
+        state += f"; the arm {wait_reason}"
     if not reset:
-        state += f"; to release{where}: rack estop {own} --reset"
-    document = {"rack": own, "emergency_stop": not reset, "tick": tick, "waits": held}
+        state += f"; to release{where}: rack estop {rack_name} --reset"
+    document = {"rack": rack_name, "emergency_stop": not reset, "tick": tick, "waits": wait_reason}
     print_answer(document, f"rack '{rack}': emergency stop {state}", as_json)
 
 
 def _stop_from_afar(address: RackAddress, reset: bool, ready: bool, operator: Operator) -> int:
-    """Set the latch of a rack on another machine, at once or when Enter is pressed; return the tick
-    at which it was set. Raises `Failure`.
+    """Set the latch of a rack on another machine, at once or when Enter is pressed.
+
+    Args:
+        address: The rack.
+        reset: Must be False: a reset from another machine is refused.
+        ready: True to connect first and wait for Enter.
+        operator: Identity under which the rack is stopped.
+
+    Returns:
+        The tick at which the latch was set.
+
+    Raises:
+        Failure: The reset is refused, or a package is missing.
     """
     if reset:
         rack = address.rack
-        why = f"resets an emergency stop on its own machine alone: rack estop {rack} --reset"
+        why = f"can only be reset on its own machine: rack estop {rack} --reset"
         raise Failure(f"rack '{rack}' {why}")
     try:
         from rack.tools.network.estop import stop, stop_when
@@ -101,7 +114,7 @@ def _stop_from_afar(address: RackAddress, reset: bool, ready: bool, operator: Op
 
 
 class _Teller:
-    """Prints on stderr what differs from the line before."""
+    """Prints a line on stderr if it differs from the previous line."""
 
     def __init__(self) -> None:
         self._last = ""
@@ -113,20 +126,22 @@ class _Teller:
 
 
 def _pressed(wait_s: float) -> bool:
-    """Wait for a line on stdin, up to a time; say whether one has come. Raises `Failure` when none
-    can come any more.
+    """Wait for a line on stdin, up to a time, and return whether one has come.
+
+    Raises `Failure` at the end of the input.
     """
     if not readable(sys.stdin.fileno(), wait_s):
         return False
     if not sys.stdin.readline():
-        raise Failure("stdin has ended, and no stop was set")
+        raise Failure("stdin has ended before a stop was set")
     return True
 
 
 def _latch(rack: str, reset: bool) -> tuple[int, str]:
-    """Set or clear the latch of a rack on this machine, and wait until the clock has seen it.
+    """Set or clear the latch of a rack on this machine, and wait until the clock has obeyed.
 
-    Return its tick, and that the arm waits for it, on a rack that is held; empty: it does not.
+    Returns:
+        The tick of the clock, and why the arm obeys later, which is empty unless the rack is held.
     """
     segment = Segment.attach(rack)
     words = segment.words
@@ -138,15 +153,15 @@ def _latch(rack: str, reset: bool) -> tuple[int, str]:
     else:
         lines.latch_emergency_stop()
     deadline = time.monotonic() + OBEY_S
-    # The demand on the arm follows at the next tick; a lost board may cause a demand, too.
-    held = ""
+    # The demand on the arm follows at the next tick. A lost board may also cause a demand.
+    wait_reason = ""
     while (words[System.DEMAND] == Demand.BRAKE) == reset and words[System.STATE] == Run.RUNNING:
-        if held := waits(segment):
+        if wait_reason := waits(segment):
             break
         if time.monotonic() > deadline:
             raise Failure(
-                f"rack '{rack}': the latch is {'clear' if reset else 'set'}, but no tick has"
-                " followed"
+                f"rack '{rack}': the latch is {'clear' if reset else 'set'}, but the clock has not"
+                f" obeyed within {OBEY_S:g} s"
             )
         time.sleep(0.001)
-    return words[System.TICK], held
+    return words[System.TICK], wait_reason

@@ -1,4 +1,4 @@
-"""`rack export`: a recorded run as a file for other programs."""
+"""`rack export`: write a recorded run as a file for other programs."""
 
 from __future__ import annotations
 
@@ -20,11 +20,12 @@ def export(
 ) -> None:
     r"""Write a recorded run as an MCAP file, which Foxglove and others read.
 
-    Each mailbox is a channel of JSON messages, whose schema has units and meanings; events are one,
-    too. Log time is simulated time, publish time the wall clock. It needs mcap: pip install
-    'nasrem-rack[export]'.
+    Each mailbox is a channel of JSON messages, whose schema has units and meanings. Events are a
+    channel, too. Log time is simulated time, publish time the wall clock. The command needs mcap:
+    pip install 'nasrem-rack[export]'.
 
-    Exit status: 0 written; 1 it could not be, or mcap is missing; 2 RUN is no run, or FILE exists.
+    Exit status: 0 written; 1 FILE cannot be written, or mcap is missing; 2 RUN is not a run, or
+    FILE exists.
 
     \b
     Examples:
@@ -40,19 +41,21 @@ def export(
     recording = Recording(run)
     path = run / "run.mcap" if out is None else out
     if path.exists():
-        raise Failure(f"{path}: exists; remove it, or give another --out", 2)
-    # Whole or not at all, also after Ctrl-C.
-    part = path.with_name(f"{path.name}.part")
+        raise Failure(f"{path}: exists already; remove it, or give another --out", 2)
+    # Write to a temporary file, so that no incomplete file is left after Ctrl-C.
+    partial_file = path.with_name(f"{path.name}.part")
     try:
         with INTERRUPT.raising():
-            count = exchange_file.export(recording, part, reading_progress(as_json, "exported"))
-        part.rename(path)
+            count = exchange_file.export(
+                recording, partial_file, reading_progress(as_json, "exported")
+            )
+        partial_file.rename(path)
     except OSError as error:
         if error.filename is not None:
             raise
         raise Failure(f"{path}: {error.strerror}") from None
     finally:
-        part.unlink(missing_ok=True)
+        partial_file.unlink(missing_ok=True)
     size = path.stat().st_size
     document = {"file": str(path), "messages": count, "bytes": size}
     print_answer(document, f"{path}: {count:,} messages, {size * 1e-6:.1f} MB", as_json)

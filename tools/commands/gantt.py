@@ -1,4 +1,4 @@
-"""`rack gantt`: the schedule of a config, or the trace of a run, as a Gantt chart."""
+"""`rack gantt`: draw the schedule of a config, or the trace of a run, as a Gantt chart."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rack.tools.timing.charts.window import WindowOptions, times_of
 
 LATEST_MS = 1e10
 MANY_SPANS = 10_000
-"""Spans from which on drawing takes a second or two."""
+"""Number of spans from which drawing takes a second or more."""
 
 
 def gantt(
@@ -29,7 +29,7 @@ def gantt(
     to_ms: float | None = option("--to-ms MS", "end of the window, ms", min=0.0, max=LATEST_MS),
     process: list[str] = option(
         "--process LEVEL=MS,MS",
-        "times of X in the schedule of a level, one a cycle, in turn; repeatable",
+        "durations of X in the schedule of a level, one for each cycle in turn; repeatable",
         [],
     ),
     figure: int | None = option(
@@ -41,13 +41,12 @@ def gantt(
     ),
     as_json: Json = False,
 ) -> None:
-    r"""Draw a Gantt chart of the schedule that follows from a config's budgets, or of the trace of a
-    run.
+    r"""Draw a Gantt chart of the schedule of a config, or of the trace of a run.
 
-    The letters are unit functions: C reads the plan, R reads command and status, X executes, W
-    writes, P plans, U updates the plan. "-" is an idle core, "." a core that another board has. A
-    run is drawn above the schedule of its config. The chart is printed as text, and drawn as PNG
-    and SVG.
+    The schedule of a config follows from its budgets. The letters are unit functions: C reads the
+    plan, R reads command and status, X executes, W writes, P plans, U updates the plan. "-" is an
+    idle core, "." a core that another board uses. A run is drawn above the schedule of its config.
+    The chart is printed as text, and drawn as PNG and SVG.
 
     Figures 2 to 4 of the paper are racks of that name.
 
@@ -57,39 +56,41 @@ def gantt(
       rack gantt fig4-overload --from-ms 60 --to-ms 78
       rack gantt runs/nasrem-20250101-120000 --from-ms 500 --to-ms 540
     """
-    found = subject_of(subject, settings, out)
+    drawn_subject = subject_of(subject, settings, out)
     if figure is not None:
-        _figure_5(found, figure, as_json)
+        _figure_5(drawn_subject, figure, as_json)
         return
     from_ns, to_ns = (None if ms is None else round(ms * NS_PER_MS) for ms in (from_ms, to_ms))
     window = WindowOptions(from_ns, to_ns)
-    chart = gantt_of(found, window, times_of(process), reading_progress(silent=as_json))
+    chart = gantt_of(drawn_subject, window, times_of(process), reading_progress(silent=as_json))
     if chart.spans > MANY_SPANS and not as_json:
         print(f"drawing {chart.spans} spans", file=sys.stderr, flush=True)
-    pictures = chart.save(_made(found.folder)) if can_draw() else []
+    pictures = chart.save(_made(drawn_subject.folder)) if can_draw() else []
     _answer(chart.text(), chart.document(), pictures, as_json)
 
 
-def _figure_5(found: Subject, figure: int, as_json: bool) -> None:
+def _figure_5(subject: Subject, figure: int, as_json: bool) -> None:
+    """Draw the paper's figure 5. Raises `Failure` for another number."""
     if figure != 5:
         raise Failure(
-            f"--figure {figure}: permitted: 5; figures 2 to 4 are racks, as in: rack gantt fig2", 2
+            f"--figure {figure}: must be 5; figures 2 to 4 are racks, as in: rack gantt fig2", 2
         )
-    pictures = figure5.save(found.config, _made(found.folder) / "figure5") if can_draw() else []
-    text = "\n".join(figure5.lines(found.config))
-    _answer(text, figure5.document(found.config), pictures, as_json)
+    pictures = figure5.save(subject.config, _made(subject.folder) / "figure5") if can_draw() else []
+    text = "\n".join(figure5.lines(subject.config))
+    _answer(text, figure5.document(subject.config), pictures, as_json)
 
 
 def _made(folder: Path) -> Path:
-    """Return the folder for the pictures, made if missing."""
+    """Create the folder for the pictures if it is missing, and return it. Raises `Failure`."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise Failure(f"--out {folder}: no folder for pictures: {error.strerror}", 2) from error
+        raise Failure(f"--out {folder}: cannot create the folder: {error.strerror}", 2) from error
     return folder
 
 
 def _answer(text: str, document: Document, pictures: list[Path], as_json: bool) -> None:
+    """Print the chart, with the paths of its pictures."""
     paths = [str(path) for path in pictures]
     files = f"pictures: {', '.join(paths)}" if paths else NO_PICTURES
     print_answer({**document, "pictures": paths}, f"{text}\n\n{files}", as_json)

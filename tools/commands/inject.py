@@ -29,27 +29,27 @@ def inject(
     mailbox: str | None = option(
         "--mailbox NAME", "mailbox to strike; default: all that the task writes"
     ),
-    tick: str | None = option("--tick T", "tick at which it begins; default: the next one"),
+    tick: str | None = option("--tick T", "tick at which the fault begins; default: the next one"),
     when: str | None = option(
         "--when CONDITION", 'begin when this holds, as in "task.status.action == 2"'
     ),
     phase: str | None = option(
-        "--phase X", "part of its first tick that passes before it strikes, 0 to below 1"
+        "--phase X", "fraction of its first tick that passes before it strikes, 0 to below 1"
     ),
     seed: str | None = option("--seed N", "seed of its random choices"),
     wait: bool = option("--wait", "wait until the fault, or the run, is over", False),
     timeout: Timeout = None,
     withdraw: int | None = option(
-        "--withdraw NO", "withdraw a fault that still waits; --list shows its number"
+        "--withdraw NO", "withdraw a fault that has not begun; --list shows its number"
     ),
     is_list: bool = option("--list", "list the kinds; with RACK, the faults of that rack", False),
     as_json: Json = False,
 ) -> None:
     r"""Inject a fault into a running rack.
 
-    It begins at the next tick and lasts to the end of the run, unless --tick, --when, --for or
-    --cycles say otherwise. With --tick or --when, or on a rack that is held, the command arms the
-    fault and returns at once; with --wait it returns when the fault is over.
+    The fault begins at the next tick and lasts to the end of the run, unless --tick, --when, --for
+    or --cycles say otherwise. With --tick or --when, or on a rack that is held, the command arms
+    the fault and returns at once; with --wait it returns when the fault is over.
 
     Exit status: 0 the fault has begun, is armed, or with --wait is over; 1 it did not begin, or
     --timeout has passed; 2 usage.
@@ -82,7 +82,7 @@ def inject(
     if withdraw is not None:
         answer = live.withdraw(withdraw)
     else:
-        given: Document = {
+        request: Document = {
             "board": board,
             "kind": kind,
             "for": lasts,
@@ -94,12 +94,12 @@ def inject(
             "seed": seed,
             **_values(parameters or []),
         }
-        answer = live.inject(given, wait, timeout)
+        answer = live.inject(request, wait, timeout)
     print_answer(answer, answer["message"], as_json)
 
 
 def _values(parameters: list[str]) -> dict[str, str]:
-    """Return parameters by name. Raises `Failure`."""
+    """Parse parameters given as KEY=VALUE. Raises `Failure`."""
     values = {}
     for text in parameters:
         key, _, value = text.partition("=")
@@ -110,17 +110,18 @@ def _values(parameters: list[str]) -> dict[str, str]:
 
 
 class KindsCommand(TyperCommand):
-    """A command whose help ends with the kinds of faults, which are imported only when it is asked
-    for.
+    """A command whose help ends with the kinds of faults.
+
+    They are imported only when the help is shown.
     """
 
     def get_help(self, ctx: Any) -> str:
-        """Return the help."""
+        """Return the help, with the kinds of faults at the end."""
         return "\n".join([super().get_help(ctx), "", "Kinds:", *kinds_text()])
 
 
 def kinds_text() -> Iterator[str]:
-    """Yield the kinds as a table, and their parameters as another."""
+    """Yield the lines of a table of fault kinds, and of a table of their parameters."""
     from rack.boards.faults import KINDS
 
     remarks = {"real time only": "realtime", "strikes once": "once"}
@@ -135,7 +136,7 @@ def kinds_text() -> Iterator[str]:
     ]
     yield from fitted(["kind", "effect", "found within", ""], rows)
     yield ""
-    yield "Cycles are the task's; a planner's is its time slice."
+    yield "A cycle is one of the task that is struck; for a planner it is its time slice."
     yield "A delivery is the time until a message is visible and its reader has read it."
     yield ""
     numbers = [
@@ -154,7 +155,7 @@ def kinds_text() -> Iterator[str]:
 
 
 def kinds_document() -> list[Document]:
-    """Return the kinds as plain data."""
+    """Build the description of the fault kinds as plain data."""
     from rack.boards.faults import KINDS
 
     numbers = ("name", "unit", "meaning", "default", "least", "most", "is_whole")

@@ -1,4 +1,4 @@
-"""`rack list`: the racks on this machine."""
+"""`rack list`: list the racks on this machine."""
 
 from __future__ import annotations
 
@@ -17,25 +17,27 @@ from rack.tools.console.tables import fitted
 def list_racks(as_json: Json = False) -> None:
     r"""List the racks on this machine, running or left behind by a killed launcher.
 
-    The states are starting, running and stopped; dead, if the launcher is gone; and foreign, if the
-    shared memory is of another version or user. `rack clean` removes dead racks.
+    The states are starting, running and stopped. A rack is dead if its launcher has ended, and
+    foreign if its shared memory belongs to another version or user. `rack clean` removes dead
+    racks.
 
-    On another machine: ssh HOST rack list.
+    To list the racks on another machine: ssh HOST rack list.
 
     \b
     Examples:
       rack list
       rack list --json
     """
-    found = [describe(name) for name in racks()]
-    rows = [[rack["rack"], rack["state"], rack["detail"]] for rack in found]
+    descriptions = [describe(name) for name in racks()]
+    rows = [[rack["rack"], rack["state"], rack["detail"]] for rack in descriptions]
     text = fitted(("rack", "state", ""), rows) if rows else "no racks"
-    print_answer(found, text, as_json)
+    print_answer(descriptions, text, as_json)
 
 
 def describe(name: str) -> Document:
-    """Return the name, as "rack", the state and details of a rack; its age is in seconds. The
-    launcher's process id is None in another PID namespace.
+    """Build the answer for one rack: its name as "rack", its state and details.
+
+    The age is in seconds. The launcher is None in another PID namespace.
     """
     try:
         segment = Segment.attach(name)
@@ -45,17 +47,17 @@ def describe(name: str) -> Document:
         words = segment.words
         age_s = time.time() - words[Head.CREATED_NS] * 1e-9
         state = "dead"
-        by = "its launcher is gone: 'rack clean' removes it"
+        launcher_text = "its launcher is gone: 'rack clean' removes it"
         if segment.launcher_is_alive:
             state = as_named(Run, words[System.STATE]).name.lower()
-            by = f"launched {age_s:.0f} s ago by {segment.launcher_text}"
+            launcher_text = f"launched {age_s:.0f} s ago by {segment.launcher_text}"
         boards = len({task.board for task in segment.layout.tasks})
         hosts = len(segment.layout.hosts)
-        side = f" and {hosts} on the host side" if hosts else ""
+        host_text = f" and {hosts} on the host side" if hosts else ""
         return {
             "rack": name,
             "state": state,
-            "detail": f"{boards} boards{side}, tick {words[System.TICK]}, {by}",
+            "detail": f"{boards} boards{host_text}, tick {words[System.TICK]}, {launcher_text}",
             "launcher": segment.launcher or None,
             "age_s": round(age_s, 3),
         }

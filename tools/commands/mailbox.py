@@ -1,4 +1,4 @@
-"""`rack mailbox`: the mailboxes of a running rack, and what is in one."""
+"""`rack mailbox`: show the mailboxes of a running rack, or the content of one."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from rack.tools.recording.signal import mailbox_of
 
 LOOK_S = 0.1
 PLAIN_S = 1.0
-"""Times between looks, real time: on a terminal or as JSON, and as plain text."""
+"""Wall-clock time between two readings: on a terminal or as JSON, and as plain text."""
 
 
 def mailbox(
@@ -26,10 +26,10 @@ def mailbox(
     watch: bool = option("--watch", "show each message, until Ctrl-C or the end of the run", False),
     as_json: Json = False,
 ) -> None:
-    r"""Show the newest message in a mailbox of a running rack, field by field with units; or list
-    the rack's mailboxes.
+    r"""Show the newest message in a mailbox of a running rack, or list its mailboxes.
 
-    Looking costs the boards nothing. With --watch and --json each message is one line.
+    The message is shown field by field with units. Reading costs the boards nothing. With --watch
+    and --json each message is one line.
 
     Exit status: 0 shown; 1 there is no such rack, or no message yet; 2 usage.
 
@@ -48,20 +48,21 @@ def mailbox(
         return
     box = mailbox_of(name, segment.layout.mailboxes)
     ring = MailboxRing(segment, box.name)
-    text = MessageText(box, segment.layout.clock_ns)
+    formatter = MessageText(box, segment.layout.clock_ns)
     if watch:
-        _watch(segment, ring, text, as_json)
+        _watch(segment, ring, formatter, as_json)
         return
     messages = ring.drain().rows
     if not len(messages):
         raise Failure(f"mailbox '{name}' has no message yet")
-    newest = text.document(messages[-1], segment.words[System.TICK])
-    print_answer(newest, text.lines(newest), as_json)
+    newest = formatter.document(messages[-1], segment.words[System.TICK])
+    print_answer(newest, formatter.lines(newest), as_json)
 
 
-def _watch(segment: Segment, ring: MailboxRing, text: MessageText, as_json: bool) -> None:
-    """Show the newest message, and those that come until the run is over: all as JSON, for people
-    the newest of each look.
+def _watch(segment: Segment, ring: MailboxRing, formatter: MessageText, as_json: bool) -> None:
+    """Show the newest message, and each new one until the run is over.
+
+    With JSON all messages are printed. For people the newest one of each reading is shown.
     """
     from rich.live import Live
     from rich.text import Text
@@ -74,12 +75,12 @@ def _watch(segment: Segment, ring: MailboxRing, text: MessageText, as_json: bool
     with live or nullcontext():
         for _ in looks(segment, look_s):
             tick = segment.words[System.TICK]
-            found = [text.document(row, tick) for row in (*rows, *ring.drain().rows)]
+            documents = [formatter.document(row, tick) for row in (*rows, *ring.drain().rows)]
             rows = rows[:0]
             if as_json:
-                for document in found:
+                for document in documents:
                     print(encode_json(document), flush=True)
-            elif live is not None and found:
-                live.update(Text("\n".join(text.lines(found[-1]))), refresh=True)
-            elif found:
-                print(*text.lines(found[-1]), "", sep="\n", flush=True)
+            elif live is not None and documents:
+                live.update(Text("\n".join(formatter.lines(documents[-1]))), refresh=True)
+            elif documents:
+                print(*formatter.lines(documents[-1]), "", sep="\n", flush=True)

@@ -1,4 +1,4 @@
-"""`rack new`: a level, a servo law or a planner of one's own to start from."""
+"""`rack new`: write a level, a servo law or a planner to start from."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ def new(
 ) -> None:
     r"""Write a folder with a class, a config that adds it to nasrem, and a test.
 
-    A level reads and writes messages, and has a live parameter and an event of its own. A servo
-    law is one method: torques from set points and sensed motion. A planner works in the background
-    of a level that reads its plans. Each runs, and passes its test, as it is.
+    A level reads and writes messages, and declares a live parameter and an event. A servo law is
+    one method: torques from set points and sensed motion. A planner works in the background of a
+    level that reads its plans. Each runs, and passes its test, without changes.
 
-    Exit status: 0 written; 2 NAME cannot be a module, or the folder is there already; then nothing
-    is written.
+    Exit status: 0 written; 2 NAME cannot be a module, or the folder exists already, and nothing is
+    written.
 
     \b
     Examples:
@@ -56,7 +56,7 @@ def new(
     try:
         folder.mkdir(parents=True)
     except FileExistsError:
-        why = f"'{folder}' is there already; name a folder that is not, by --out"
+        why = f"'{folder}' exists already; name a new folder with --out"
         raise Failure(why, 2) from None
     for path, text in written.items():
         path.write_text(text, encoding="utf-8")
@@ -70,18 +70,18 @@ def new(
 
 
 def _flaw(kind: str, name: str) -> str:
-    """Return why a name cannot be that of the module, its rack and, of a level, its board."""
+    """Return why a name cannot be used for the module, its rack and its board, or an empty text."""
     if not re.fullmatch(RACK_NAME, name) or not name.isidentifier() or keyword.iskeyword(name):
-        return "permitted: a-z, 0-9 and '_', at most 40, a letter first; no keyword of Python"
+        return "must be at most 40 of a-z, 0-9 and '_', begin with a letter, and not be a keyword"
     if name in names() or name in load("nasrem").board:
         return "a bundled config, or a board of nasrem, has that name"
     if find_spec(name) is not None:
         return "an installed module has that name"
     source = (TEMPLATES / kind / f"my_{kind}.py").read_text()
-    used = re.findall(rf"\b(?!{_class_name(f'my_{kind}')})\w+", source)
-    made = re.findall(r"^class (\w+)", _filled(source, kind, name), re.MULTILINE)
-    for clash in sorted({*made} & {*used}):
-        return f"its class {clash} would have the name of one that it uses"
+    used_names = re.findall(rf"\b(?!{_class_name(f'my_{kind}')})\w+", source)
+    class_names = re.findall(r"^class (\w+)", _filled(source, kind, name), re.MULTILINE)
+    for clash in sorted({*class_names} & {*used_names}):
+        return f"its class would be named {clash}, as a class that it uses"
     return ""
 
 
@@ -90,6 +90,6 @@ def _class_name(name: str) -> str:
 
 
 def _filled(text: str, kind: str, name: str) -> str:
-    """Return a file of a template with the user's names in place of its own."""
-    theirs = f"my_{kind}"
-    return text.replace(theirs, name).replace(_class_name(theirs), _class_name(name))
+    """Replace the names in a file of a template by the user's name."""
+    template_name = f"my_{kind}"
+    return text.replace(template_name, name).replace(_class_name(template_name), _class_name(name))

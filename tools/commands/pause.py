@@ -1,5 +1,7 @@
-"""`rack pause` and `rack resume`: a rack in lockstep is held between two ticks; in real time its
-arm comes to rest on its path, and goes on from there.
+"""`rack pause` and `rack resume`: pause a rack, and let it continue.
+
+In lockstep the rack is held between two ticks. In real time its arm comes to rest on its path, and
+continues from there.
 """
 
 from __future__ import annotations
@@ -16,12 +18,12 @@ from rack.tools.monitor import pausing
 def pause(rack: RackName, as_json: Json = False) -> None:
     r"""Pause a rack until 'rack resume'.
 
-    In lockstep it is held before its next tick, as by 'rack step'. In real time the clock goes on:
-    the operator's hold of the highest level brings the arm to rest on its path. A level that does
-    an operator's command keeps it, and the one below is held.
+    In lockstep the rack is held before its next tick, as by 'rack step'. In real time the clock
+    keeps running: an operator's hold of the highest level brings the arm to rest on its path. A
+    level that executes another command of an operator keeps it, and the level below is held.
 
     Exit status: 0 the rack is held, or the arm at rest; 1 there is no such rack, its run ended, or
-    none of its levels takes a hold.
+    none of its levels can hold.
 
     \b
     Examples:
@@ -30,18 +32,19 @@ def pause(rack: RackName, as_json: Json = False) -> None:
     """
     with INTERRUPT.raising(), closing(Segment.attach(rack)) as segment:
         tick, levels = pausing.pause(segment)
-    what = f"held before tick {tick}"
+    state = f"held before tick {tick}"
     if levels:
-        what = f"'{levels[0]}' held by the operator, at rest since tick {tick}"
+        state = f"'{levels[0]}' held by the operator, at rest since tick {tick}"
     document = {"rack": rack, "paused": True, "levels": levels, "tick": tick}
-    print_answer(document, f"rack '{rack}': {what}; it goes on by: rack resume {rack}", as_json)
+    print_answer(document, f"rack '{rack}': {state}; to continue: rack resume {rack}", as_json)
 
 
 def resume(rack: RackName, as_json: Json = False) -> None:
-    r"""Let a paused rack go on: the clock in lockstep, in real time the highest level that an
-    operator holds.
+    r"""Let a paused rack continue.
 
-    Exit status: 0 it goes on; 1 it is not paused, or there is no such rack.
+    In lockstep this releases the clock, in real time the highest level that an operator holds.
+
+    Exit status: 0 the rack continues; 1 it is not paused, or there is no such rack.
 
     \b
     Examples:
@@ -50,4 +53,4 @@ def resume(rack: RackName, as_json: Json = False) -> None:
     with INTERRUPT.raising(), closing(Segment.attach(rack)) as segment:
         levels = pausing.resume(segment)
     document = {"rack": rack, "paused": False, "levels": levels}
-    print_answer(document, f"rack '{rack}' goes on", as_json)
+    print_answer(document, f"rack '{rack}' continues", as_json)

@@ -1,4 +1,4 @@
-"""`rack prompt`: a Python prompt, or a script, on the host side of a running rack."""
+"""`rack prompt`: open a Python prompt, or run a script, on the host side of a running rack."""
 
 from __future__ import annotations
 
@@ -33,17 +33,16 @@ def prompt(
         "SCRIPT", "Python script to run, in place of a prompt", None, dir_okay=False
     ),
 ) -> None:
-    r"""Open a Python prompt on the host side of a running rack, or run a script there.
+    r"""Open a Python prompt, or run a script, on the host side of a running rack.
 
-    It takes the place of the program of a host board with `external = true`, one process at a time.
-    `program` is the board's program, whose ports read and send messages; it may offer more names.
-    `bus` has the time, and waits for messages.
-    Whatever happens here, the real-time side is not delayed. The prompt can be left and opened
-    again while the rack runs. Its program is a class that the rack's config names: the rack must be
-    one's own.
+    The prompt runs as the program of a host board with `external = true`, one process at a time.
+    `program` is the board's program, whose ports read and send messages. It may define more names.
+    `bus` has the time, and waits for messages. Nothing that happens at the prompt delays the
+    real-time side. The prompt can be closed and opened again while the rack runs. Because its
+    program is a class that the config of the rack names, the rack must belong to you.
 
-    Exit status: 0 prompt closed; 1 there is no such rack, it is another user's, the board is in
-    use, or the script failed; 2 usage.
+    Exit status: 0 prompt closed; 1 there is no such rack, it belongs to another user, the board is
+    in use, or the script failed; 2 usage.
 
     \b
     Examples:
@@ -54,7 +53,7 @@ def prompt(
     if segment.run_is_over:
         raise Failure(f"rack '{rack}': the run is over")
     if (owner := os.fstat(segment.fd).st_uid) != os.getuid():
-        why = "a prompt runs the program that its config names, which only that user may do"
+        why = "only that user may run the program that its config names"
         raise Failure(f"rack '{rack}' belongs to user {owner}: {why}")
     wiring = _wiring(segment, board)
     program = find_class(wiring.target, HostProgram)(wiring.context)
@@ -72,43 +71,47 @@ def prompt(
 
 
 def _wiring(segment: Segment, board: str | None) -> HostWiring:
-    """Return the wiring of the external board. Raises `Failure` if there is none, or a choice of
-    several.
+    """Return the wiring of the external host board.
+
+    Raises `Failure` if none fits, or several do.
     """
-    found = {host.board: host for host in resolve(loads(segment.config)).hosts if host.is_external}
-    names = ", ".join(found) or "none"
-    if board is None and len(found) != 1:
+    wirings = {
+        host.board: host for host in resolve(loads(segment.config)).hosts if host.is_external
+    }
+    names = ", ".join(wirings) or "none"
+    if board is None and len(wirings) != 1:
         raise Failure(f"BOARD is missing; external host boards of '{segment.rack}': {names}", 2)
-    if board is not None and board not in found:
+    if board is not None and board not in wirings:
         raise Failure(
-            f"BOARD = {board}: not an external host board of '{segment.rack}'; permitted: {names}",
+            f"BOARD = {board}: must be an external host board of '{segment.rack}': {names}",
             2,
         )
-    return found[board or next(iter(found))]
+    return wirings[board or next(iter(wirings))]
 
 
 @contextlib.contextmanager
 def _python_signals() -> Iterator[None]:
-    """Let signals act as Python's own prompt and scripts expect: Ctrl-C is `KeyboardInterrupt`."""
-    before = {number: signal.getsignal(number) for number in SIGNALS}
+    """Handle signals as Python's prompt and scripts expect: Ctrl-C raises `KeyboardInterrupt`."""
+    previous = {number: signal.getsignal(number) for number in SIGNALS}
     signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         yield
     finally:
-        for number, handler in before.items():
+        for number, handler in previous.items():
             signal.signal(number, handler)
 
 
 def _interact(rack: str, board: str, names: dict[str, Any]) -> None:
+    """Open a prompt in which `names` are defined."""
     with contextlib.suppress(ImportError):
         import readline  # noqa: F401  line editing and history
 
-    offered = ", ".join(names)
-    code.interact(f"rack {rack}, host board '{board}': {offered}", local=names, exitmsg="")
+    names_text = ", ".join(names)
+    code.interact(f"rack {rack}, host board '{board}': {names_text}", local=names, exitmsg="")
 
 
 def _run(script: Path, names: dict[str, Any]) -> None:
-    """Run a script. Raises `Failure` with the exception, in one line, that ended it."""
+    """Run a script. Raises `Failure` with the exception that ended it, in one line."""
     if not script.is_file():
         raise Failure(f"{script}: no such file", 2)
     try:

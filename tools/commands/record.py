@@ -29,7 +29,7 @@ from rack.tools.viewer.parts import FILE
 from rack.tools.viewer.window import ViewerWindow, free_port, url
 
 LOOK_S = 0.1
-"""Time between two looks at the racks, and at their recorders."""
+"""Time between two checks of the racks and their recorders."""
 
 
 def record(
@@ -38,7 +38,7 @@ def record(
     out: Path | None = option("--out DIR", "folder of the recording; default: runs/<rack>-<time>"),
     view: View = False,
     save: bool = option(
-        "--save", "save what the recorder of its run has taken so far; the run is untouched", False
+        "--save", "save the recording of its run so far, without touching the run", False
     ),
     as_json: Json = False,
 ) -> None:
@@ -48,12 +48,12 @@ def record(
     analyze` and `rack replay` read it. Recording costs the rack no deadline, and ending it does not
     end the run.
 
-    With others that it works with, each is recorded into its own folder DIR/<rack>. When the runs
-    of all are over, DIR/run.rrd shows them on one time line, that of the first. Record a rack of
-    another machine there, and join the copied folders with `rack replay`.
+    With --with, each rack is recorded into a separate folder DIR/<rack>. When all runs are over,
+    DIR/run.rrd shows them on the time line of the first rack. Record a rack of another machine on
+    that machine, and join the copied folders with `rack replay`.
 
-    --save writes what the recorder of `rack run` has taken so far into a folder that opens as a run
-    does, and ends; run and recording go on.
+    --save copies what the recorder of `rack run` has recorded so far into a new run folder. Run and
+    recording continue.
 
     \b
     Examples:
@@ -65,22 +65,22 @@ def record(
     racks = [rack, *others]
     if others and view:
         raise Failure(
-            "--view, --with: give one of them: the racks have a common time line only in the end", 2
+            "--view, --with: give one of them: the racks have a common time line only at the end", 2
         )
     if save and (others or view):
         raise Failure(f"--save, {'--with' if others else '--view'}: give one of them", 2)
     with ExitStack() as stack:
-        attached = (closing(Segment.attach(str(named_here(each)))) for each in racks)
-        found = [stack.enter_context(one) for one in attached]
-        segment = found[0]
+        attached = (closing(Segment.attach(str(named_here(name)))) for name in racks)
+        segments = [stack.enter_context(attached_segment) for attached_segment in attached]
+        segment = segments[0]
         folder = folder_of(out, rack)
         if save:
             print_answer(*_saved(segment, folder), as_json)
             return
         clock_ns = segment.layout.clock_ns
-        begun = max(0, segment.words[System.TICK] - round(KEPT_S * 1e9 / clock_ns))
-        notes = _record(found, folder, view)
-        lasted_s = (segment.words[System.TICK] - begun) * clock_ns * 1e-9
+        first_tick = max(0, segment.words[System.TICK] - round(KEPT_S * 1e9 / clock_ns))
+        notes = _record(segments, folder, view)
+        lasted_s = (segment.words[System.TICK] - first_tick) * clock_ns * 1e-9
     for text in notes:
         print(text, file=sys.stderr)
     answer = {"rack": rack, "folder": str(folder), "notes": notes, **sizes(folder, lasted_s)}
@@ -88,11 +88,11 @@ def record(
 
 
 def _saved(segment: Segment, folder: Path) -> tuple[Document, str]:
-    """Save what is recorded of a running rack; return the answer, as data and as a line."""
+    """Save the recording of a running rack so far. Returns the answer as data and as a line."""
     name = segment.layout.rack
     run = recorded_by(segment)
     if run is None:
-        raise Failure(f"--save {name}: nothing records it; 'rack record {name}' begins to")
+        raise Failure(f"--save {name}: the rack is not recorded; 'rack record {name}' records it")
     with INTERRUPT.raising():
         save_run(run, folder)
         traces = [rows["tick"] for rows in Recording(folder).cycles.values()]
@@ -103,27 +103,34 @@ def _saved(segment: Segment, folder: Path) -> tuple[Document, str]:
     tick_s = segment.layout.clock_ns * 1e-9
     since_s, until_s = float(first * tick_s), float(last * tick_s)
     size = size_of(folder)
-    much = size_text(size, until_s - since_s)
-    line = f"saved into {folder}: {since_s:.2f} s to {until_s:.2f} s, {much}"
+    size_note = size_text(size, until_s - since_s)
+    summary = f"saved into {folder}: {since_s:.2f} s to {until_s:.2f} s, {size_note}"
     times = {"since_s": since_s, "until_s": until_s}
-    return {"rack": name, "folder": str(folder), **times, "bytes": size}, line
+    return {"rack": name, "folder": str(folder), **times, "bytes": size}, summary
 
 
 def save_run(folder: Path, into: Path) -> None:
-    """Make a run's folder, `into`, of what the recorder of `folder` has taken so far; that one goes
-    on.
-    """
+    """Copy the recording in `folder` so far to the run folder `into`. The recorder continues."""
     stretches = (f"{STRETCHES}/{path.name}" for path in stretch_files(folder))
     for name in (CONFIG, PUBLISHED, ORIGIN, CODE, EVENTS, CHECKSUMS, SPOOL, *stretches):
         (into / name).parent.mkdir(parents=True, exist_ok=True)
-        # The flight recorder may have removed it meanwhile; few runs have an origin.
+        # The flight recorder may have removed a file since, and few runs have an origin.
         with suppress(FileNotFoundError):
             copyfile(folder / name, into / name)
     mend(into)
 
 
 def _begin(segment: Segment, folder: Path, port: int | None) -> RecorderProcess:
-    """Begin to record a rack into a folder; return its recorder. Raises `Failure`."""
+    """Start to record a rack into a folder.
+
+    Args:
+        segment: The rack.
+        folder: Run folder, created if missing.
+        port: Port at which the recorder serves the viewer. None for no viewer.
+
+    Raises:
+        Failure: The folder cannot be written, or the recorder does not start.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / CONFIG).write_text(segment.config)
@@ -139,16 +146,23 @@ def _begin(segment: Segment, folder: Path, port: int | None) -> RecorderProcess:
 
 
 def _record(racks: Sequence[Segment], folder: Path, view: bool) -> list[str]:
-    """Record a rack into a folder; or each of several into its own, then all of them into one
-    file. Return messages for the user.
+    """Record racks until their runs are over.
+
+    Args:
+        racks: One rack, or several, which are then joined on one time line.
+        folder: Run folder of the rack, or folder that gets a run folder for each of several.
+        view: True to open the viewer. Only for one rack.
+
+    Returns:
+        Notes for the user.
     """
     names = [rack.layout.rack for rack in racks]
-    if twice := [name for at, name in enumerate(names) if name in names[:at]]:
-        raise Failure(f"--with {twice[0]}: this rack is to be recorded already", 2)
+    if duplicates := [name for at, name in enumerate(names) if name in names[:at]]:
+        raise Failure(f"--with {duplicates[0]}: each rack can be recorded only once", 2)
     folders = [folder / name for name in names] if len(racks) > 1 else [folder]
     unfinished = ""
     if len(racks) > 1:
-        unfinished = f"{folder / FILE} is missing; 'rack replay {folder}' makes it"
+        unfinished = f"{folder / FILE} is missing; 'rack replay {folder}' creates it"
     port = free_port() if view else None
     # Ctrl-C ends the recording, not the run.
     with INTERRUPT.orderly(unfinished=unfinished):
@@ -168,14 +182,14 @@ def _record(racks: Sequence[Segment], folder: Path, view: bool) -> list[str]:
             return [*notes, *merge(folders, folder / FILE)]
         except Failure as failure:
             raise Failure(
-                f"recorded into {', '.join(map(str, folders))}; not on one time line: {failure}"
+                f"recorded into {', '.join(map(str, folders))}, but not joined: {failure}"
             ) from None
 
 
 def _follow(
     racks: Sequence[Segment], recorders: Sequence[RecorderProcess], unfinished: str
 ) -> list[str]:
-    """Record until the runs of all are over, or until Ctrl-C; return messages of the recorders."""
+    """Record until all runs are over, or until Ctrl-C. Returns notes of the recorders."""
     notes: list[str] = []
     ended = Event()
     with INTERRUPT.orderly(ended.set, unfinished):

@@ -1,4 +1,4 @@
-"""`rack replay`: open recordings in the viewer; those of several racks on one time line."""
+"""`rack replay`: open recordings in the viewer, several racks on one time line."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from rack.tools.viewer.parts import FILE, parts_of
 from rack.tools.viewer.window import ViewerWindow, has_screen
 
 Places = Callable[[Sequence[Recording]], list[RackPlace]]
+"""Puts recordings on one time line."""
 
 
 def replay(
@@ -27,28 +28,28 @@ def replay(
         "RUN...", "folder of a run, as in runs/nasrem-20250101-120000; one for each rack"
     ),
     out: Path | None = option(
-        "--out FILE.rrd", "make the viewer's file from what is recorded, and open nothing"
+        "--out FILE.rrd", "write the recording to a file for the viewer, and do not open it"
     ),
     against: Path | None = option(
         "--against RUN",
-        "another run of the same rack, or 'origin', the one that RUN continues: both, tick by tick",
+        "also show another run of the same rack, or 'origin' for the run that RUN continues",
     ),
 ) -> None:
-    r"""Open the recording of a run in the viewer; return when it is closed.
+    r"""Open the recording of a run in the viewer, and wait until it is closed.
 
-    It shows the arm in 3D, its curves, a Gantt lane for each task, and the log. RUN may also be a
-    run.rrd.
+    The viewer shows the arm in 3D, its curves, a Gantt lane for each task, and the log. RUN may
+    also be a run.rrd.
 
-    Of several racks that ran together, give the folder of each: they are shown at once, each under
-    its name, on the time line of the first. Their clocks are compared by what the racks recorded of
-    each other; how uncertain that is stands in the log. Recordings that did not run together are
-    refused.
+    For several racks that ran together, give the folder of each. They are shown side by side under
+    their names, on the time line of the first. Their clocks are compared by the messages that the
+    racks recorded of each other, and the log states the uncertainty. Racks that did not run
+    together are refused.
 
-    With --against, two runs of one rack are shown at once, each under the name of its folder, on
-    one time line, tick by tick: a branch, say, and the run that it branches off. The log marks
-    where it branches off, and the first message that differs.
+    With --against, two runs of one rack, such as a run and its branch, are shown tick by tick on
+    one time line, under the names of their folders. The log marks the tick of the branch and the
+    first message that differs.
 
-    A run without run.rrd, as of a flight recorder ([record] keep), is first made into a file.
+    A run without run.rrd, such as one of a flight recorder ([record] keep), is converted first.
 
     \b
     Examples:
@@ -61,7 +62,7 @@ def replay(
     place: Places = on_one_time_line
     if against is not None:
         if len(runs) > 1:
-            raise Failure("--against: permitted with one RUN", 2)
+            raise Failure("--against: give exactly one RUN", 2)
         place = side_by_side
         runs = [other_run(runs[0], against), *runs]
     if out is None and len(runs) == 1 and (recordings := _own(runs[0])):
@@ -78,24 +79,25 @@ def replay(
             _show(Path(folder, "run.rrd"))
     else:
         raise Failure(
-            "no screen: DISPLAY and WAYLAND_DISPLAY are not set; --out FILE.rrd saves it for one"
+            "no screen: DISPLAY and WAYLAND_DISPLAY are not set; --out FILE.rrd writes a file"
         )
 
 
 def _own(run: Path) -> list[Path]:
-    """Return the viewer's files of a run: a long one has several, as has a restarted recorder.
-    Raises `Failure` for a damaged one.
+    """Return the viewer's files of a run. A long run and a restarted recorder have several.
+
+    Raises `Failure` for a damaged file.
     """
     is_file = run.suffix == ".rrd"
     checksums = Checksums(run.parent if is_file else run)
-    found = [run] if is_file and run.is_file() else parts_of(run / FILE)
-    # A recorder that was killed has left one without a checksum.
-    checksums.verify(*{part.name for part in found} & {*checksums.stored})
-    return found
+    files = [run] if is_file and run.is_file() else parts_of(run / FILE)
+    # A killed recorder leaves a file without a checksum.
+    checksums.verify(*{part.name for part in files} & {*checksums.stored})
+    return files
 
 
 def _parts(run: Path) -> list[Path]:
-    """Return the runs in a folder that `rack record --with` has made; of any other, itself."""
+    """Return the runs in a folder made by `rack record --with`, or the folder if it is a run."""
     parts = (
         [] if (run / CONFIG).exists() else sorted(path.parent for path in run.glob(f"*/{CONFIG}"))
     )
@@ -103,15 +105,18 @@ def _parts(run: Path) -> list[Path]:
 
 
 def _show(*recordings: Path) -> None:
+    """Open the viewer and wait until it is closed. Raises `Failure` if it fails."""
     if problem := ViewerWindow(*(str(recording.resolve()) for recording in recordings)).wait():
         raise Failure(problem)
 
 
 def _make(runs: Sequence[Path], out: Path, place: Places) -> None:
+    """Write the file of `merge_runs`, printing its notes.
+
+    Raises `Failure` for an unusable `out`.
+    """
     if out.suffix != ".rrd":
-        raise Failure(
-            f"--out {out}: not the name of a viewer's file; permitted: a name that ends in .rrd", 2
-        )
+        raise Failure(f"--out {out}: the name of a file for the viewer must end in .rrd", 2)
     if out.exists():
         raise Failure(f"--out {out}: exists already", 2)
     for note in merge(runs, out, place):
@@ -119,10 +124,18 @@ def _make(runs: Sequence[Path], out: Path, place: Places) -> None:
 
 
 def merge(runs: Sequence[Path], out: Path, place: Places = on_one_time_line) -> list[str]:
-    """Write the viewer's file of runs that `place` puts on one time line, as those recorded
-    together; return what a user should know of their times.
+    """Write runs to one file for the viewer.
 
-    Raises `Failure` if they cannot be read, or have no time in common.
+    Args:
+        runs: Run folders.
+        out: The file.
+        place: Puts the runs on one time line, by default as racks that ran together.
+
+    Returns:
+        Notes for the user about the times of the runs.
+
+    Raises:
+        Failure: A run cannot be read, or the runs have no time in common.
     """
     for run in runs:
         if not run.is_dir():
@@ -130,9 +143,9 @@ def merge(runs: Sequence[Path], out: Path, place: Places = on_one_time_line) -> 
             raise Failure(f"{run}: {why}", 2)
     placed = place([Recording(run) for run in runs])
     tick_s = placed[0].own.clock_ns * 1e-9
-    marks = [mark for one in placed for mark in one.marks]
+    marks = [mark for recording in placed for mark in recording.marks]
     notes = [f"{tick * tick_s:g} s: {text}" if tick else text for tick, text in marks]
-    # It takes half a second to import.
+    # Import late, because this takes half a second.
     from rack.tools.viewer.merged import write_merged
 
     try:

@@ -1,4 +1,4 @@
-"""`rack report`: report on a run, from its recording."""
+"""`rack report`: report on a run from its recording."""
 
 from __future__ import annotations
 
@@ -14,35 +14,36 @@ def report(
     run: RunFolder,
     against: Path | None = option(
         "--against RUN",
-        "another run, or 'origin', the one that RUN continues: where the two diverge, and why",
+        "find where and why RUN diverges from this run, or from 'origin', the run it continues",
     ),
     of: str = option(
         "--of MAILBOX",
-        "with --against: from where this mailbox first differs, back to the cause",
+        "with --against: start at the first difference in this mailbox, and search for the cause",
         "",
     ),
     repeat: bool = option(
         "--repeat",
-        "with --against: if the recordings leave it open, run both racks again, with the"
+        "with --against: if the recordings do not show the cause, run both racks again, with the"
         " levels that their configs name",
         False,
     ),
     as_json: Json = False,
 ) -> None:
-    r"""Report on a run, from its recording.
+    r"""Report on a run from its recording.
 
-    It writes report.json and report.md, unless those of the run are newer than its recording and
-    this program. On a terminal the tables show as many columns as fit; report.md has all.
+    The command writes report.json and report.md, unless those of the run are newer than its
+    recording and this program. On a terminal the tables show as many columns as fit; report.md has
+    all.
 
     With --against it names the first message that differs, its fields, and whether its writer had
-    read the same in both runs. If not, it goes back along what differed, to the cycle whose inputs
-    were equal. There it names what is different: a fault, a loss, a command, a miss, a setting. If
-    that leaves the level's state and code, --repeat runs both racks in lockstep again, to that
-    cycle: which attributes of the level differed before it, and whether its code repeats what it
-    wrote. No other report runs code of a run.
+    read the same inputs in both runs. If not, it follows the differing inputs back to a cycle with
+    equal inputs, and names the cause: a fault, a loss, a command, a miss or a setting. If only the
+    state and code of the level remain, --repeat runs both racks in lockstep again up to that cycle.
+    It reports which attributes of the level differed before it, and whether the code repeats what
+    it wrote. No other report runs code of a run.
 
     Exit status: 0 the report was printed; 1 with --against: the runs diverge before any miss; 2 RUN
-    is not a run, or the two cannot be compared: they are of different racks, or either lacks rows.
+    is not a run, or the two cannot be compared: they are of different racks, or one lacks rows.
 
     \b
     Examples:
@@ -53,7 +54,7 @@ def report(
     """
     if against is None:
         if of or repeat:
-            raise Failure("--of and --repeat: permitted with --against", 2)
+            raise Failure("--of and --repeat need --against", 2)
         show_report(run, as_json)
         return
     from rack.tools.recording.divergence import other_run

@@ -1,6 +1,4 @@
-"""`rack reproduce`: the paper, section by section, next to predictions and measurements of this
-machine.
-"""
+"""`rack reproduce`: go through the paper, with predictions and measurements of this machine."""
 
 from __future__ import annotations
 
@@ -14,47 +12,46 @@ from rack.tools.console.parameters import Json, option
 from rack.tools.launch.folder import RUNS
 
 PAGE = RUNS / "paper"
-"""Where the page is made unless a folder is given: always the same one, so that the command
-continues."""
+"""Default folder of the page. It is always the same, so that the command continues."""
 NO_LAB = "the page needs jinja2: pip install 'nasrem-rack[lab]'"
-STAYS = "{}: what is finished is kept; the same command goes on from there"
+STAYS = "{}: finished experiments are kept; the same command continues from there"
 
 
 def reproduce(
-    out: Path = option("--out DIR", "folder of the page; one that exists is continued", PAGE),
+    out: Path = option("--out DIR", "folder of the page; an existing one is continued", PAGE),
     only: list[str] = option(
         "--only SECTION", 'only this section, as in 3.4 or "abstract"; repeatable', []
     ),
     again: bool = option(
-        "--again", "repeat finished experiments: of the sections of --only, or of all", False
+        "--again", "repeat finished experiments, of the sections of --only or of all", False
     ),
     share: bool = option(
         "--share",
-        "run even on cores held by another rack's real-time boards: figures suffer",
+        "run even on cores of another rack's real-time boards, at the price of worse figures",
         False,
     ),
     as_json: Json = False,
 ) -> None:
     r"""Reproduce the paper on this machine, and write a page that goes through it claim by claim.
 
-    The paper is NISTIR 90-4251 (1990). Each claim, equation and figure is given in its words, with
-    what the timing model predicts of it, what real processes have shown, and a ruling: it holds; it
+    The paper is NISTIR 90-4251 (1990). Each claim, equation and figure is quoted, with the
+    prediction of the timing model, the measurement with real processes, and a ruling: it holds; it
     holds here, within bounds; the paper contradicts itself; it is not testable here; or it does not
     hold here.
 
-    The page is DIR/index.html and, as Markdown, DIR/README.md; figures are drawn in letters.
-    DIR/paper.json has everything as data, DIR/runs the recordings: `rack report`, `rack gantt` and
-    `rack analyze` read them.
+    The page is DIR/index.html and, as Markdown, DIR/README.md. Figures are drawn in letters.
+    DIR/paper.json has everything as data. DIR/runs has the recordings, for `rack report`, `rack
+    gantt` and `rack analyze`.
 
-    Every ruling results from comparisons of measured values, which the page lists. A claim is not
-    judged by a run that does not show it, such as one in which a level made no plan.
+    Every ruling results from comparisons of measured values, which the page lists. A run that does
+    not show a claim does not judge it, such as a run in which a level made no plan.
 
-    It takes fifteen minutes on two cores. Do not use the machine meanwhile: real-time
-    figures suffer. What is finished is kept, also if the command is interrupted or killed: given
-    again, it continues. A change of configs, program or machine makes the experiments anew that
-    depend on it.
+    The experiments take fifteen minutes on two cores. Do not use the machine during this time,
+    because real-time figures suffer. Finished experiments are kept, even if the command is
+    interrupted or killed; the same command continues. After a change of configs, program or machine
+    the experiments that depend on it are repeated.
 
-    Exit status: 0 every experiment was made, and no claim failed; 1 otherwise; 2 usage error.
+    Exit status: 0 all experiments were made, and no claim failed; 1 otherwise; 2 usage error.
 
     \b
     Examples:

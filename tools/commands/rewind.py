@@ -1,4 +1,4 @@
-"""`rack rewind`: go through a recorded run, to any tick, and branch off there."""
+"""`rack rewind`: go to any tick of a recorded run, and branch off from it."""
 
 from __future__ import annotations
 
@@ -36,27 +36,26 @@ MOST_S = 1e9
 
 
 def rewind(run: RunFolder, anyway: Anyway = False, as_json: Json = False) -> None:
-    r"""Go back to any tick of a recorded run, see what was in force there and what the levels held
-    in their own objects, and branch off.
+    r"""Go to any tick of a recorded run, inspect messages and levels, and branch off.
 
-    It opens a prompt; commands may come from stdin, too, one a line. With --json each answer is a
-    document on one line, that of a command that fails an object with 'error'.
+    The command opens a prompt. Commands can also come from stdin, one a line. With --json each
+    answer is a document on one line, and the answer of a failed command has the key 'error'.
 
     \b
       goto 12.5, goto --when "servo.status.position[2] > 1.2"
       step [TICKS], back [TICKS], back --when CONDITION
       show primitive.status, show primitive.plan, show servo.status.position[2]
-      show primitive          the attributes of the level's own object
+      show primitive          the attributes of the level's object
       events [SECONDS]        what happened around this tick
       branch [--set KEY=VALUE]... [--faults FILE] [--seconds S] [--out DIR]
       help [COMMAND], quit
 
-    A tick is shown as it is before its tasks begin: messages are those that they then read.
-    Messages and events come from the recording. For the objects of levels, and branches, the rack
-    runs again unchanged, from the beginning or from where it was before. RUN is only read.
+    A tick is shown before its tasks begin, with the messages that they are about to read. Messages
+    and events come from the recording. For the objects of levels, and for branches, the rack runs
+    again unchanged, from the beginning or from an earlier snapshot. RUN is only read.
 
-    Exit status: 0 the prompt was left; of commands from stdin or with --json: 0 all worked, 2 one
-    failed; 2 RUN is not a run.
+    Exit status: 0 the prompt was left, and all commands from stdin or with --json worked; 2 one of
+    them failed, or RUN is not a run.
 
     \b
     Examples:
@@ -78,15 +77,19 @@ def rewind(run: RunFolder, anyway: Anyway = False, as_json: Json = False) -> Non
 
 
 class _Arguments(argparse.ArgumentParser):
-    """The arguments of a command at the prompt: a mistake is one line, and no end."""
+    """Parser for the arguments of a command at the prompt. A mistake raises `Failure`."""
 
     def error(self, message: str) -> NoReturn:
-        """Raise `Failure`."""
-        raise Failure(f"{self.prog}: {message}; permitted: {USAGE[self.prog]}", 2)
+        """Raise `Failure` with the mistake and the usage of the command."""
+        raise Failure(f"{self.prog}: {message}; usage: {USAGE[self.prog]}", 2)
 
 
 class RewindPrompt(cmd.Cmd):
-    """The commands of the prompt; `failed` counts those that did not work."""
+    """The prompt and its commands.
+
+    Attributes:
+        failed: Number of commands that failed.
+    """
 
     def __init__(self, run: RewoundRun, as_json: bool) -> None:
         super().__init__()
@@ -96,14 +99,14 @@ class RewindPrompt(cmd.Cmd):
 
     @property
     def prompt(self) -> str:  # type: ignore[override]
-        """Where one is."""
+        """Text of the prompt: the current simulated time."""
         return f"{self._run.time_s(self._run.tick):g} s> "
 
     def onecmd(self, line: str) -> bool:
-        """Do one command; return True for the last."""
+        """Execute one command. Returns True if it was the last."""
         try:
             with as_failure():
-                # A branch that a signal has ended was the last command.
+                # A signal that ended a branch also ends the prompt.
                 return bool(super().onecmd(line)) or INTERRUPT.number != 0
         except Failure as failure:
             self._fail(str(failure))
@@ -112,22 +115,24 @@ class RewindPrompt(cmd.Cmd):
         return False
 
     def _fail(self, why: str) -> None:
+        """Count and print a failure."""
         self.failed += 1
         text = one_line(why, MAX_LINE)
         print(encode_json({"error": text}) if self._as_json else text, flush=True)
 
-    def _answer(self, found: Glance) -> None:
+    def _answer(self, answer: Glance) -> None:
+        """Print an answer, as JSON or as lines."""
         if self._as_json:
-            print(encode_json(found.document), flush=True)
+            print(encode_json(answer.document), flush=True)
         else:
-            print(*found.lines, sep="\n", flush=True)
+            print(*answer.lines, sep="\n", flush=True)
 
     def emptyline(self) -> bool:
-        """Do nothing: a branch is not repeated by accident."""
+        """Do nothing on an empty line, so that a branch is not repeated by accident."""
         return False
 
     def default(self, line: str) -> None:
-        """Name the nearest command. Raises `Failure`."""
+        """Reject an unknown command. Raises `Failure` with the nearest commands."""
         if line.startswith("#"):
             return
         name = line.split()[0]
@@ -135,56 +140,68 @@ class RewindPrompt(cmd.Cmd):
         raise Failure(f"{name}: no such command; nearest: {', '.join(near)}", 2)
 
     def do_goto(self, line: str) -> None:
-        """Go to a simulated time, s; or on to the next tick at which readers find that a condition
-        has begun to hold: it did not in the message before. Comparisons: == != <= >= < >; a state
-        may be named, as in "primitive.status.state == holding".
+        """Go to a simulated time, s, or to the next tick at which a condition begins to hold.
+
+        The condition begins to hold at a message for which it holds, after one for which it does
+        not.
+        Comparisons: == != <= >= < >; a state may be named, as in "primitive.status.state ==
+        holding".
         """
-        given = _given("goto", line)
-        if (given.time is None) == (given.when is None):
-            raise Failure(f"goto: permitted: {USAGE['goto']}", 2)
-        if given.when is not None:
-            self._answer(self._run.goto_when(" ".join(given.when)))
+        arguments = _given("goto", line)
+        if (arguments.time is None) == (arguments.when is None):
+            raise Failure(f"goto: usage: {USAGE['goto']}", 2)
+        if arguments.when is not None:
+            self._answer(self._run.goto_when(" ".join(arguments.when)))
         else:
-            self._answer(self._run.goto(given.time))
+            self._answer(self._run.goto(arguments.time))
 
     def do_step(self, line: str) -> None:
-        """Go on by a tick, or by so many."""
+        """Go forward by one tick, or by TICKS."""
         self._answer(self._run.step(_given("step", line).ticks))
 
     def do_back(self, line: str) -> None:
-        """Go back by a tick, or by so many; or to the last tick before this one at which a
-        condition began to hold, as with goto.
+        """Go back by one tick or by TICKS, or to the tick at which a condition last began to hold.
+
+        Conditions are written as for goto.
         """
-        given = _given("back", line)
-        if given.when is not None:
-            self._answer(self._run.goto_when(" ".join(given.when), back=True))
+        arguments = _given("back", line)
+        if arguments.when is not None:
+            self._answer(self._run.goto_when(" ".join(arguments.when), back=True))
         else:
-            self._answer(self._run.step(-given.ticks))
+            self._answer(self._run.step(-arguments.ticks))
 
     def do_show(self, line: str) -> None:
-        """Show the message in force in a mailbox, as in primitive.status, or primitive.plan for the
-        plan; one signal in it, as in servo.status.position[2]; or, by the name of a task, as in
-        primitive or primitive.planner, the attributes of the level's own object at this tick.
+        """Show a message, one of its signals, or the object of a level at this tick.
+
+        The name can be a mailbox, as in primitive.status, or primitive.plan for the plan; a signal,
+        as in
+        servo.status.position[2]; or a task, as in primitive or primitive.planner, for the
+        attributes of the
+        level's object.
         """
         self._answer(self._run.show(_given("show", line).name))
 
     def complete_show(self, text: str, line: str, begin: int, end: int) -> Sequence[str]:
-        """Return the names that may follow."""
+        """List the names that complete a text."""
         return [name for name in self._run.names if name.startswith(text)]
 
     def do_events(self, line: str) -> None:
-        """Show the events at most so long before and after this tick; 1 s unless given."""
+        """Show the events within SECONDS before and after this tick, by default 1 s."""
         self._answer(self._run.events(_given("events", line).seconds))
 
     def do_branch(self, line: str) -> None:
-        """Let the rack go on from this tick with other settings or faults, record that as a run of
-        its own, and say where it first differs. --seconds counts from the beginning of the run;
-        default: until the task ends, or for as long as the run was.
+        """Run the rack from this tick with other settings or faults, and record that as a new run.
+
+        The answer states where the branch first differs. --seconds counts from the beginning of the
+        run. By
+        default the branch ends with its task, or after as long a time as the run.
         """
-        given = _given("branch", line)
+        arguments = _given("branch", line)
         with display_for(silent=self._as_json) as display:
-            found = self._run.branch(given.set, given.faults, given.out, given.seconds, display)
-        self._answer(found)
+            answer = self._run.branch(
+                arguments.set, arguments.faults, arguments.out, arguments.seconds, display
+            )
+        self._answer(answer)
 
     def do_help(self, arg: str) -> None:
         """List the commands, or explain one."""
@@ -196,29 +213,29 @@ class RewindPrompt(cmd.Cmd):
         self._answer(Glance({"help": "\n".join(lines)}, lines))
 
     def do_quit(self, line: str) -> bool:
-        """Leave the prompt; so does the end of input."""
+        """Leave the prompt. The end of the input does the same."""
         return True
 
     def do_EOF(self, line: str) -> bool:  # noqa: N802  the name that `cmd` gives the end of input
-        """End."""
+        """Leave the prompt at the end of the input."""
         print()
         return True
 
 
 def _seconds(text: str) -> float:
-    """Return a time, s. Raises `ArgumentTypeError`."""
+    """Parse a time, s. Raises `ArgumentTypeError`."""
     with suppress(ValueError):
-        if 0.0 <= (found := float(text)) <= MOST_S:
-            return found
-    raise argparse.ArgumentTypeError(f"{text}: permitted: 0 to {MOST_S:g} s")
+        if 0.0 <= (seconds := float(text)) <= MOST_S:
+            return seconds
+    raise argparse.ArgumentTypeError(f"{text}: must be 0 to {MOST_S:g} s")
 
 
 def _ticks(text: str) -> int:
-    """Return a number of ticks. Raises `ArgumentTypeError`."""
+    """Parse a number of ticks. Raises `ArgumentTypeError`."""
     with suppress(ValueError):
-        if abs(found := int(text)) <= LAST_TICK:
-            return found
-    raise argparse.ArgumentTypeError(f"{text}: permitted: at most {LAST_TICK} ticks, either way")
+        if abs(ticks := int(text)) <= LAST_TICK:
+            return ticks
+    raise argparse.ArgumentTypeError(f"{text}: must be -{LAST_TICK} to {LAST_TICK} ticks")
 
 
 _WHEN = {"nargs": "+"}
@@ -236,14 +253,14 @@ ARGUMENTS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
         "--out": {"type": Path},
     },
 }
-"""Of each command its arguments, as `argparse` takes them."""
+"""Arguments of each command, in the form that `argparse` takes."""
 
 
 def _given(command: str, line: str) -> argparse.Namespace:
-    """Return what is given to a command. Raises `Failure`."""
+    """Parse the arguments of a command. Raises `Failure`."""
     parser = _Arguments(command, add_help=False, allow_abbrev=False)
-    for name, how in ARGUMENTS[command].items():
-        parser.add_argument(name, **how)
+    for name, settings in ARGUMENTS[command].items():
+        parser.add_argument(name, **settings)
     try:
         words = shlex.split(line, comments=True)
     except ValueError as error:

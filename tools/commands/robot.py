@@ -1,4 +1,4 @@
-"""`rack robot`: any arm, from a model file to a config that runs."""
+"""`rack robot`: bring up any arm, from a model file to a config that runs."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ app = typer.Typer(
 def new(
     model: Path = argument("MODEL", "model file: MJCF, or URDF"),
     name: str = option("--name NAME", "name of the rack; default: the model's", ""),
-    tip: str = option("--tip NAME", "body or site at the end of the arm, if there are two", ""),
+    tip: str = option("--tip NAME", "body or site at the end of the arm, to choose one of two", ""),
     joints: str = option(
         "--joints J,J,...", "joints of the arm, base to tool, in place of --tip", ""
     ),
@@ -49,14 +49,14 @@ def new(
 ) -> None:
     r"""Write a folder with a config, a scene and a task for the arm of a model file.
 
-    What the model states is taken: the joints along the chain, their limits, torques of actuators
-    or of a URDF's efforts, a keyframe. The rest is found (the tool, a home free of contact, the
-    gripper's drive, what follows it or the jaw it closes on, bodies that always overlap) or
-    guessed: each guess is named here, in the file, and in [robot] guessed. Two blocks on a table
-    are moved, or, without a gripper that can, poses toured; the planner has rehearsed it. On a
-    terminal it asks for what no option says.
+    The config takes from the model: the joints along the chain, their limits, the torques of
+    actuators or a URDF's efforts, and a keyframe. The rest is found (the tool, a home free of
+    contact, the drive of the gripper and the joints or jaw that go with it, bodies that always
+    overlap) or guessed. Each guess is named here, in the file, and in [robot] guessed. The task
+    moves two blocks on a table, or tours poses if no gripper can take blocks. The planner has
+    rehearsed it. On a terminal the command asks for values that no option gives.
 
-    Exit status: 0 written; 2 nothing can be made of the model, and nothing is written.
+    Exit status: 0 written; 2 the model cannot be used, and nothing is written.
 
     \b
     Examples:
@@ -71,17 +71,17 @@ def new(
     derived = derive_name(model.stem, taken)
     name = name or (_asked("name", derived) if asks else derived)
     if not is_free_name(name, taken):
-        why = "permitted: a-z, 0-9, '-' and '_', at most 40, and no bundled config's name"
+        why = "must be at most 40 of a-z, 0-9, '-' and '_', and not the name of a bundled config"
         raise Failure(f"--name = {name}: {why}; for example {derive_name(name, taken)}", 2)
     folder = out or Path(name)
     if folder.exists():
-        raise Failure(f"--out: '{folder}' is there already; name a folder that is not", 2)
+        raise Failure(f"--out: '{folder}' exists already; name a new folder", 2)
     chain = tuple(filter(None, joints.split(",")))
-    wanted = Wishes(tip, chain, tool, gripper, home, _numbers(torque, "--torque"))
+    wanted = Wishes(tip, chain, tool, gripper, home, _numbers(torque))
     with drafting(model) as draft:
-        made = _made(model, wanted, draft / name, name, asks)
+        document = _made(model, wanted, draft / name, name, asks)
         shutil.copytree(draft / name, folder)
-    print_answer(made | {"folder": str(folder)}, _lines(made, folder, name), as_json)
+    print_answer(document | {"folder": str(folder)}, _lines(document, folder, name), as_json)
 
 
 @app.command("check")
@@ -90,14 +90,14 @@ def check(
     out: Path | None = option("--out PNG", "file of the picture; default: NAME.png"),
     as_json: Json = False,
 ) -> None:
-    r"""Examine an arm before it moves, and draw it: everything at once.
+    r"""Examine an arm before it moves, and draw it.
 
-    Of a config its arm, of a model file the arm that `rack robot new` would make of it: axes,
-    limits, reach, payload at the edge of its reach, contacts at home, bodies that nothing holds,
-    actuators by kind, coupling of the gripper, one finger or two, natural frequency, objects that
-    fall without end.
+    The arm belongs to a config, or is drafted from a model file as by `rack robot new`. The
+    report shows axes, limits, reach, payload at the edge of the reach, contacts at home, unattached
+    bodies, actuators by kind, the coupling of the gripper, its fingers, the natural frequency, and
+    objects that fall without end.
 
-    Exit status: 0 all is well; 1 something fails; 2 nothing can be made of it.
+    Exit status: 0 all checks pass; 1 a check fails; 2 the model cannot be used.
 
     \b
     Examples:
@@ -123,38 +123,39 @@ def check(
         sys.exit(1)
 
 
-def _examined(given: str, folder: Path) -> tuple[Examined, str]:
-    """Return the arm of a config or a model, and its name. Raises `RobotError`."""
+def _examined(model: str, folder: Path) -> tuple[Examined, str]:
+    """Examine the arm of a config or a model. Returns also its name. Raises `RobotError`."""
     from rack.tools.robot.draft import CLOCK_NS, NOTHING, Wishes, draft
     from rack.tools.robot.findings import examine
     from rack.tools.robot.source import read_source
 
-    if Path(given).suffix not in ("", ".toml"):
-        made = draft(read_source(Path(given)), Wishes(), folder, "arm")
-        return examine(made.robot, NOTHING, CLOCK_NS), derive_name(Path(given).stem, ())
-    config = load(given)
+    if Path(model).suffix not in ("", ".toml"):
+        drafted = draft(read_source(Path(model)), Wishes(), folder, "arm")
+        return examine(drafted.robot, NOTHING, CLOCK_NS), derive_name(Path(model).stem, ())
+    config = load(model)
     if config.robot is None:
-        raise RobotError(f"config '{given}' has no [robot]")
+        raise RobotError(f"config '{model}' has no [robot]")
     return examine(config.robot, config.scene, config.clock_ns), config.name
 
 
-def _report(found: Document) -> Iterator[str]:
-    yield from fitted_records(found["joints"])
-    yield f"reach {found['reach_m']} m, payload {found['payload_kg']} kg wherever it reaches"
-    for finding in found["findings"]:
+def _report(document: Document) -> Iterator[str]:
+    """Yield the lines of the answer for people."""
+    yield from fitted_records(document["joints"])
+    yield f"reach {document['reach_m']} m, payload {document['payload_kg']} kg at any pose in reach"
+    for finding in document["findings"]:
         verdict = "FAILS" if finding["fails"] else "ok"
         yield f"{verdict}  {finding['about']}: {finding['text']}"
-    yield f"picture: {found['picture']}"
+    yield f"picture: {document['picture']}"
 
 
 def _asked(text: str, default: str = "") -> str:
-    """Return what the user answers; nothing, where the default is what is found."""
-    shown = text if default else f"{text} [found]"
-    return str(typer.prompt(shown, default, show_default=bool(default))).strip()
+    """Ask the user for a value. An empty answer means the default, or what the draft will find."""
+    question = text if default else f"{text} [found]"
+    return str(typer.prompt(question, default, show_default=bool(default))).strip()
 
 
 def _completed(source: Source, wanted: Wishes) -> Wishes:
-    """Ask on the terminal for what no option says. Raises `RobotError`."""
+    """Ask on the terminal for each value that no option gives. Raises `RobotError`."""
     from rack.levels.robot.model import listed
     from rack.tools.robot.arm import find_arm
 
@@ -175,8 +176,11 @@ def _completed(source: Source, wanted: Wishes) -> Wishes:
 
 @contextmanager
 def drafting(model: Path) -> Iterator[Path]:
-    """Provide a temporary folder; errors name the user's model in place of files in it. Raises
-    `Failure`.
+    """Provide a temporary folder for a draft.
+
+    Raises:
+        Failure: A `RobotError` of the body. Its text names the user's model, not files in the
+            folder.
     """
     with TemporaryDirectory() as folder:
         try:
@@ -186,20 +190,20 @@ def drafting(model: Path) -> Iterator[Path]:
 
 
 def _without(folder: Path, text: str, model: Path) -> str:
+    """Replace paths of the temporary folder in a text by the path of the model."""
     return re.sub(f"{re.escape(str(folder))}[^']*", lambda _: str(model), text)
 
 
-def _numbers(text: str, option: str) -> tuple[float, ...]:
+def _numbers(text: str) -> tuple[float, ...]:
+    """Parse torque limits. Raises `Failure`."""
     try:
         return tuple(float(number) for number in text.split(",") if text)
     except ValueError:
-        raise Failure(f"{option} = {text}: not numbers, as in 80,80,12", 2) from None
+        raise Failure(f"--torque = {text}: must be numbers, as in 80,80,12", 2) from None
 
 
 def _made(model: Path, wanted: Wishes, folder: Path, name: str, asks: bool) -> Document:
-    """Write the folder of an arm, asking for more if `asks`; return what it is. Raises
-    `RobotError`.
-    """
+    """Write the folder of an arm, and return the answer to `--json`. Raises `RobotError`."""
     from rack.tools.robot.assignment import lay_out
     from rack.tools.robot.draft import draft
     from rack.tools.robot.folder import config_text, document
@@ -210,22 +214,25 @@ def _made(model: Path, wanted: Wishes, folder: Path, name: str, asks: bool) -> D
     source = read_source(model)
     if asks:
         wanted = _completed(source, wanted)
-    made = draft(source, wanted, folder, name)
-    layout = lay_out(made)
-    (folder / f"{name}.toml").write_text(config_text(made, layout, name, model), encoding="utf-8")
-    picture = draw(made.cell(layout.scene), folder / f"{name}.png")
+    drafted = draft(source, wanted, folder, name)
+    layout = lay_out(drafted)
+    (folder / f"{name}.toml").write_text(
+        config_text(drafted, layout, name, model), encoding="utf-8"
+    )
+    picture = draw(drafted.cell(layout.scene), folder / f"{name}.png")
     if picture == NO_PICTURE:
-        made.notes.append(picture)
-    made.notes = [_without(folder, note, model) for note in made.notes]
-    return document(made, layout, folder, name)
+        drafted.notes.append(picture)
+    drafted.notes = [_without(folder, note, model) for note in drafted.notes]
+    return document(drafted, layout, folder, name)
 
 
-def _lines(made: Document, folder: Path, name: str) -> Iterator[str]:
-    yield f"{folder}: {len(made['joints'])} joints, {', '.join(made['joints'])}; {made['task']}"
-    yield from made["notes"]
-    for key, why in made["guessed"].items():
+def _lines(document: Document, folder: Path, name: str) -> Iterator[str]:
+    joints = document["joints"]
+    yield f"{folder}: {len(joints)} joints, {', '.join(joints)}; {document['task']}"
+    yield from document["notes"]
+    for key, why in document["guessed"].items():
         yield f"guessed: {key}: {why}"
-    own = folder / f"{name}.toml"
-    # By name a file beside the folder is found first.
-    is_found = folder == Path(name) and not Path(own.name).exists()
-    yield f"rack run {name if is_found else shlex.quote(str(own))}"
+    config_path = folder / f"{name}.toml"
+    # A file beside the folder would be found first under that name.
+    is_found = folder == Path(name) and not Path(config_path.name).exists()
+    yield f"rack run {name if is_found else shlex.quote(str(config_path))}"

@@ -1,4 +1,4 @@
-"""`rack run`: launch a rack, watch it, record it, report."""
+"""`rack run`: launch a rack, watch it, record it, and report on it."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def run(
         False,
     ),
     step: bool = option(
-        "--step", "with --lockstep: hold before tick 0; 'rack step' lets the rack go on", False
+        "--step", "with --lockstep: hold before tick 0; 'rack step' continues the rack", False
     ),
     seconds: float | None = option(
         "--seconds S", "simulated seconds to run; default: until its end", min=0.0, max=1e9
@@ -54,15 +54,14 @@ def run(
     faults: Faults = None,
     entries: Path | None = option(
         "--entries RUN",
-        "start no host boards and no other racks: what they sent in this recorded run"
-        " enters again, at the same ticks; for host boards in real time, or with a prompt:"
-        " other runs repeat in lockstep by themselves",
+        "do not start host boards and other racks; instead replay what they sent in this recorded"
+        " run, at the same ticks; needed to repeat runs with real-time host boards or a prompt,"
+        " since all others repeat in lockstep by themselves",
     ),
     origin: str | None = option(
         "--from RUN@TIME",
-        "continue a run, in place of CONFIG, from TIME s, bit for bit; with --set or"
-        " --faults a branch of it from there; the rack runs again in lockstep, from the"
-        " beginning to TIME",
+        "in place of CONFIG: continue a run from TIME s, bit for bit, or branch off with --set or"
+        " --faults; the rack first runs again in lockstep, from the beginning to TIME",
     ),
     anyway: Anyway = False,
     out: Path | None = option("--out DIR", "folder of the run; default: runs/<rack>-<time>"),
@@ -72,27 +71,26 @@ def run(
     view: View = False,
     share: bool = option(
         "--share",
-        "run even on cores held by another rack's real-time boards: both will be late",
+        "run even on cores of another rack's real-time boards, although both will be late",
         False,
     ),
     as_json: Json = False,
 ) -> None:
     r"""Run a rack until its task ends, and report on the run.
 
-    A rack that names others in adapter.lan.launch launches them, too, each in a process of its own;
-    one that fails ends all. On a terminal a live table shows every task and what holds the rack;
-    elsewhere one line a second is printed. --json prints the report as one document. With
+    A rack that names others in adapter.lan.launch also launches them, each by a separate 'rack
+    run'. If one fails, all end. On a terminal a live table shows every task and what holds the
+    rack; elsewhere one line a second is printed. --json prints the report as one document. With
     --no-record it has the same keys; those that need a recording are null.
 
-    With --from, the rack first runs again, unchanged, from the beginning to TIME. What operators
-    commanded in that run, before TIME and after it, is repeated; stops and faults by hand are not.
-    Host boards and other racks
-    are not started then: what they sent enters again at the same ticks.
-    --seconds counts from the beginning of the run that is continued, as there.
+    With --from, the rack first runs again, unchanged, from the beginning to TIME. Commands of
+    operators in that run, before TIME and after it, are repeated. Stops and faults by hand are not.
+    Host boards and other racks are not started. What they sent is replayed at the same ticks.
+    --seconds counts from the beginning of the run that is continued.
 
     Exit status: 0 the task was done, with its objects at their goals, or --seconds have passed; no
     fault is latched, and the recording is complete. 1 otherwise, also if brakes or a level held the
-    rack for over 5 s, or brakes for half of the run, without a cause in sight; if a level missed or
+    rack for over 5 s, or brakes for half of the run, without a known cause; if a level missed or
     skipped more of its cycles than supervision.max_missed_fraction permits; or if the system
     response exceeded its bound without a lost cycle. 2 usage or config error. A full disk ends the
     run. Ctrl-C ends it in order, with a report and exit status 130.
@@ -109,23 +107,21 @@ def run(
       rack run --from runs/whole@10 --faults bad-sensors
     """
     if view and no_record:
-        raise Failure(
-            "--view and --no-record: the viewer shows what the recorder takes; leave one out", 2
-        )
+        raise Failure("--view and --no-record: the viewer shows what is recorded; leave one out", 2)
     if (config is None) == (origin is None):
-        raise Failure("permitted: CONFIG, or --from RUN@TIME in its place; see --help", 2)
+        raise Failure("give either CONFIG or --from RUN@TIME; see --help", 2)
     overrides = list(settings)
     overrides += ["clock.mode=lockstep"] if lockstep or origin is not None else []
     overrides += [f"clock.speed={speed}"] if speed is not None else []
     if origin is not None and entries is not None:
-        raise Failure("--entries and --from: a run that is continued has its own; leave one out", 2)
+        raise Failure("--entries and --from: --from replays the entries anyway; leave one out", 2)
     if origin is not None:
         from rack.tools.launch.continued import beginning, run_of
 
         config = str(run_of(origin))
     assert config is not None
-    read = assembled(config, overrides, faults)
-    crate = _informed(context.obj, read.tables)
+    tables_read = assembled(config, overrides, faults)
+    crate = _informed(context.obj, tables_read.tables)
     from rack.boards.config.loader import validated
     from rack.tools.launch.folder import folder_of
     from rack.tools.launch.launch import NO_TIME, Beginning, run_rack
@@ -135,50 +131,54 @@ def run(
     if entries is not None:
         from rack.tools.recording.entries import recorded_entries
 
-    found = validated(read)
-    if step and found.clock.mode != "lockstep":
+    rack_config = validated(tables_read)
+    if step and rack_config.clock.mode != "lockstep":
         raise Failure("--step: real time cannot be held between two ticks; add --lockstep", 2)
-    folder = None if no_record else folder_of(out, found.name)
+    folder = None if no_record else folder_of(out, rack_config.name)
     begins = Beginning(crate=crate)
     with ExitStack() as stack:
         if origin is not None:
             warm = crate if isinstance(crate, WarmCrate) else None
-            begins = stack.enter_context(beginning(found, origin, warm, anyway))
-        # From the start of the run to the end of its report; during the launch a signal ends the
-        # command at once.
+            begins = stack.enter_context(beginning(rack_config, origin, warm, anyway))
+        # Applies from the start of the run to the end of its report. During the launch, `run_rack`
+        # lets a signal end the command at once.
         unfinished = NO_TIME.format(folder) if folder else ""
         stack.enter_context(INTERRUPT.orderly(unfinished=unfinished))
         with display_for(silent=as_json) as display:
             if entries is not None:
-                begins = Beginning(crate=crate, entries=recorded_entries(found, entries))
+                begins = Beginning(crate=crate, entries=recorded_entries(rack_config, entries))
             result = run_rack(
-                found, seconds, folder, display, view=view, share=share, step=step, begins=begins
+                rack_config,
+                seconds,
+                folder,
+                display,
+                view=view,
+                share=share,
+                step=step,
+                begins=begins,
             )
-        report = _report(found, folder, result, as_json)
+        report = _report(rack_config, folder, result, as_json)
     if not report["worked"]:
-        # On stderr and last, where it is seen in any case.
-        print(headline(found.name, report["outcome"], report["failures"]), file=sys.stderr)
+        # Print the verdict last and on stderr, where the user sees it in any case.
+        print(headline(rack_config.name, report["outcome"], report["failures"]), file=sys.stderr)
     sys.exit(0 if report["worked"] else 1)
 
 
 def _informed(crate: CrateLine | None, tables: Tables) -> CrateLine | None:
-    """Let the crate load the levels that a config names, while this process imports what checks the
-    config.
-    """
+    """Let the crate load the levels of a config while this process imports the config checks."""
     if crate is not None:
-        own = tables.get("python_path")
+        python_path = tables.get("python_path")
         crate.send(
             Preload(
-                named_classes(tables), (*sys.path, *map(str, own if isinstance(own, list) else []))
+                named_classes(tables),
+                (*sys.path, *map(str, python_path if isinstance(python_path, list) else [])),
             )
         )
     return crate
 
 
 def _report(config: RackConfig, folder: Path | None, result: RunResult, as_json: bool) -> Document:
-    """Make the report, print it and return it. A run that has no report where one is wanted has
-    failed.
-    """
+    """Write the report, print it and return it. A run whose report cannot be written has failed."""
     from rack.tools.recording.folder_size import recorded_line
     from rack.tools.report.report import unrecorded, write_report
     from rack.tools.report.report_markdown import summary

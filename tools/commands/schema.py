@@ -1,4 +1,4 @@
-"""`rack schema`: every key of a config, from the models that validate it."""
+"""`rack schema`: show the keys of a config, taken from the models that validate it."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ def schema(
 ) -> None:
     r"""Show the keys of a config: type, unit, permitted values, default and meaning.
 
-    Without TABLE it lists the tables. The levels' own tables, [task] and [board.<name>.params], are
-    those of the boards in CONFIG. A part of a name shows all tables that begin with it.
+    Without TABLE the command lists the tables. [task] and [board.<name>.params] depend on the
+    levels of CONFIG. The beginning of a name shows all tables that begin with it.
 
     \b
     Examples:
@@ -46,21 +46,22 @@ def schema(
 
     rack = load(config)
     try:
-        found = key_tables(rack) if name is None else find_tables(name, rack)
+        tables = key_tables(rack) if name is None else find_tables(name, rack)
     except LookupError as error:
         raise Failure(f'TABLE = "{name}": {error.args[0]}', 2) from None
-    lines = _keys(found)
+    lines = _keys(tables)
     if name is None:
-        rows = [[entry.name, entry.heading, entry.meaning] for entry in found]
+        rows = [[entry.name, entry.heading, entry.meaning] for entry in tables]
         lines = fitted(["table", "in TOML", "meaning"], rows, ("in TOML",))
-    print_answer([asdict(entry) for entry in found], lines, as_json)
+    print_answer([asdict(entry) for entry in tables], lines, as_json)
 
 
-def _keys(found: list[KeyTable]) -> Iterator[str]:
+def _keys(tables: list[KeyTable]) -> Iterator[str]:
+    """Yield the lines of each table with its keys."""
     head = ["key", "unit", "type", "permitted", "default", "meaning"]
-    for at, entry in enumerate(found):
-        rows = [[k.name, k.unit, k.type, k.permitted, k.default, k.meaning] for k in entry.keys]
+    for at, table in enumerate(tables):
+        rows = [[k.name, k.unit, k.type, k.permitted, k.default, k.meaning] for k in table.keys]
         if at:
             yield ""
-        yield f"{entry.heading}: {entry.meaning}"
+        yield f"{table.heading}: {table.meaning}"
         yield from fitted(head, rows, DROPPED)

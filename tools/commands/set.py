@@ -20,12 +20,13 @@ def set_param(
 ) -> None:
     r"""Set a live parameter of a running rack, between two cycles of its level.
 
-    'rack schema' marks those that a level declares as live; all others are read at the launch
-    alone. This is an operator's command: the level sets it again when its board is restarted, and a
-    run in lockstep repeats with the same command, what = "set", in its config.
+    'rack schema' marks the parameters that a level declares as live. All others are read only at
+    the launch. The command counts as an operator's: it is given again when the board of the level
+    is restarted. To repeat the run in lockstep, put the same command, what = "set", into the
+    config.
 
-    Exit status: 0 the parameter is set; 1 the level refused it, or did not answer in time; 2 it is
-    not live, or the value is not valid.
+    Exit status: 0 the parameter is set; 1 the level refused it, or did not answer in time; 2 the
+    parameter is not live, or the value is invalid.
 
     \b
     Examples:

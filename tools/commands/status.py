@@ -1,4 +1,4 @@
-"""`rack status`: one look at a running rack."""
+"""`rack status`: show a running rack once."""
 
 from __future__ import annotations
 
@@ -36,8 +36,7 @@ def status(rack: OnlyRack = None, as_json: Json = False) -> None:
     Each task has a line with its cycles, misses, longest times and state. A hold is shown with its
     time, its reason, and the command that releases it.
 
-    Exit status: 0 it was shown; 1 there is no such rack; 2 RACK is missing and several racks are
-    running.
+    Exit status: 0 shown; 1 there is no such rack; 2 RACK is missing and several racks are running.
 
     \b
     Examples:
@@ -45,19 +44,22 @@ def status(rack: OnlyRack = None, as_json: Json = False) -> None:
       rack status nasrem --json
     """
     with closing(Segment.attach(rack or only_rack())) as segment:
-        found = RackMonitor(segment).look()
+        snapshot = RackMonitor(segment).look()
         run = recorded_by(segment)
     if as_json:
         recording = None if run is None else {"folder": str(run), "bytes": size_of(run)}
-        print_json({**asdict(found), "recording": recording})
+        print_json({**asdict(snapshot), "recording": recording})
         return
-    console().print(RackView(found))
+    console().print(RackView(snapshot))
     if run is not None:
-        print(recorded_line(run, found.time_s))
+        print(recorded_line(run, snapshot.time_s))
 
 
 def only_rack() -> str:
-    """Return the only rack on this machine. Raises `Failure` if there is not exactly one."""
+    """Return the name of the only rack on this machine.
+
+    Raises `Failure` if there is not exactly one.
+    """
     running = racks()
     if not running:
         raise Failure("no rack is running")
@@ -67,15 +69,16 @@ def only_rack() -> str:
 
 
 def recorded_by(segment: Segment) -> Path | None:
-    """Return the folder into which a rack is recorded; None if it is not, or if that cannot be
-    seen from this PID namespace.
+    """Find the folder into which a rack is recorded.
+
+    Returns None if it is not recorded, or if this cannot be seen from this PID namespace.
     """
     if not segment.launcher:
         return None
     pid = segment.words[System.FOLLOWER_PID]
     with suppress(OSError):
         for file in Path(f"/proc/{pid}/fd").iterdir():
-            # Descriptors come and go.
+            # A descriptor may be closed while this loop runs.
             with suppress(OSError):
                 if (path := file.readlink()).name == SPOOL:
                     return path.parent

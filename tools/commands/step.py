@@ -1,6 +1,4 @@
-"""`rack step`: let a rack in lockstep go on by single ticks or cycles, and show what its levels
-did.
-"""
+"""`rack step`: advance a rack in lockstep by single ticks or cycles."""
 
 from __future__ import annotations
 
@@ -22,15 +20,14 @@ def step(
         "--ticks N", "ticks of the clock, instead of cycles", min=1, max=10**9
     ),
     until: str | None = option("--until LEVEL", "hold after the next cycle of this level"),
-    run: bool = option("--run", "let the rack run on without steps", False),
+    run: bool = option("--run", "let the rack run without holding", False),
     as_json: Json = False,
 ) -> None:
-    r"""Let a rack in lockstep go on by single cycles, and show each level's state, and the row of
-    its state table.
+    r"""Advance a rack in lockstep by single cycles, and show the state of each level.
 
     Start the rack with 'rack run CONFIG --lockstep --step': it holds before tick 0. A rack that
-    runs in lockstep is held by its first step. Without options it goes on until every level has
-    done one more cycle.
+    already runs in lockstep is held by its first step. Without options the rack advances until
+    every level has completed one more cycle. For a level with a state table, its row is shown.
 
     Exit status: 0 the steps are done; 1 there is no such rack, it is not in lockstep, or its run
     ended; 2 usage.
@@ -44,21 +41,23 @@ def step(
       rack step nist-state-table --run
     """
     if count is not None and cycles is not None:
-        raise Failure(f"N = {count}: the same as --cycles; give one of them", 2)
+        raise Failure(f"N = {count}: N and --cycles mean the same; give one of them", 2)
     cycles = cycles if count is None else count
     if ticks is not None and (cycles is not None or until is not None):
         raise Failure(
-            "--ticks counts ticks, N, --cycles and --until count cycles; give one of them", 2
+            "--ticks counts ticks, but N, --cycles and --until count cycles; give one of them", 2
         )
-    if run and any(given is not None for given in (cycles, ticks, until)):
-        raise Failure("--run lets the rack run on; leave out the steps", 2)
+    if run and any(value is not None for value in (cycles, ticks, until)):
+        raise Failure("--run lets the rack run without holding; leave out the steps", 2)
     stepper = Stepper(Segment.attach(rack))
     if run:
         stepper.let_go()
-        print_answer({"rack": rack, "held": False}, f"rack '{rack}' runs on", as_json)
+        print_answer({"rack": rack, "held": False}, f"rack '{rack}' runs without holding", as_json)
         return
-    at = stepper.hold()
-    end = stepper.after_cycles(at, cycles or 1, until) if ticks is None else at + ticks
-    stepper.go(end)
-    found = stepper.look()
-    print_answer(asdict(found), found.lines(), as_json)
+    held_tick = stepper.hold()
+    end_tick = (
+        stepper.after_cycles(held_tick, cycles or 1, until) if ticks is None else held_tick + ticks
+    )
+    stepper.go(end_tick)
+    held_rack = stepper.look()
+    print_answer(asdict(held_rack), held_rack.lines(), as_json)

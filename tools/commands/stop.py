@@ -17,11 +17,11 @@ def stop(
     wait: float = option("--wait S", "seconds to wait for the run's end", 10.0, min=0.0, max=1e9),
     as_json: Json = False,
 ) -> None:
-    r"""End a run and wait until it is gone.
+    r"""End a run, and wait until its launcher has ended.
 
     The run ends in order at its next tick, and writes its report.
 
-    Exit status: 0 it has ended; 1 there is no such rack, or it is still running after --wait.
+    Exit status: 0 the run has ended; 1 there is no such rack, or it is still running after --wait.
 
     \b
     Examples:
@@ -36,10 +36,15 @@ def stop(
 
 
 def stop_rack(rack: str, timeout_s: float) -> bool:
-    """Request a rack's end and wait for its launcher to end; return False if it still runs after
-    `timeout_s`. In another PID namespace, wait until the launcher has closed the rack.
+    """Request the end of a rack and wait until its launcher has ended.
 
-    Raises `SegmentError` when there is no such rack.
+    In another PID namespace, it waits until the launcher has closed the rack.
+
+    Returns:
+        False if the launcher still runs after `timeout_s`.
+
+    Raises:
+        SegmentError: There is no such rack.
     """
     with ExitStack() as stack:
         segment = stack.enter_context(closing(Segment.attach(rack)))
@@ -48,8 +53,8 @@ def stop_rack(rack: str, timeout_s: float) -> bool:
             if segment.launcher:
                 launcher = os.pidfd_open(segment.launcher)
                 stack.callback(os.close, launcher)
-        # In this order: a later process may have the number of a dead launcher, and one that has
-        # closed the rack still writes the report.
+        # Check after opening the pidfd, because the pid of a dead launcher may have been reused. A
+        # launcher that has closed the rack is still alive while it writes the report.
         is_own = launcher >= 0 and segment.launcher_is_alive
         segment.words[System.STOP_REQUEST] = 1
         return readable(launcher, timeout_s) if is_own else segment.await_launcher(timeout_s)

@@ -1,4 +1,4 @@
-"""`rack top`: a running rack, looked at again and again."""
+"""`rack top`: watch a running rack until its end."""
 
 from __future__ import annotations
 
@@ -11,26 +11,27 @@ from rack.tools.commands.status import OnlyRack, only_rack
 from rack.tools.console.interrupt import INTERRUPT
 
 LOOK_S = 0.2
-"""Time from look to look."""
+"""Time between two snapshots, s."""
 
 
 def top(rack: OnlyRack = None) -> None:
     r"""Watch a running rack until its run is over, or until Ctrl-C.
 
-    On a terminal it fills the screen, if textual is there (pip install 'nasrem-rack[live]'), and
-    keys command the rack. Elsewhere one line a second is printed. Watching costs the rack no
-    deadline. Where it ends the run goes on, and the commands that it has given stay in force.
+    On a terminal the view fills the screen, if textual is installed (pip install
+    'nasrem-rack[live]'), and keys command the rack. Elsewhere one line a second is printed.
+    Watching costs the rack no deadline. When the view is closed, the run continues, and commands
+    given from it stay in force.
 
-    A rack on another machine: ssh -t HOST rack top.
+    To watch a rack on another machine: ssh -t HOST rack top.
 
     \b
     1 2 3 4  boards, mailboxes, events, lateness
-    l        the level that keys command, shown in reverse
+    l        select the level that keys command, shown in reverse
     h r      hold it, let it resume
     c        type a command, as in: task goto home
     i        choose a fault, change it, inject it
     e E      set the emergency stop, reset it
-    w q      forget the worst times, leave
+    w q      forget the worst times, quit
 
     \b
     Examples:

@@ -1,4 +1,4 @@
-"""`rack watch`: signals of a running rack, live, or what was around a moment."""
+"""`rack watch`: plot live signals, or capture a window around a trigger."""
 
 from __future__ import annotations
 
@@ -20,11 +20,14 @@ from rack.tools.monitor.signals import Lines, Plot, Rows, Strip, cell
 from rack.tools.recording.signal import Signal, Trigger
 
 LOOK_S = 0.02
-"""Time between looks: rings hold 2 s, in a fast lockstep a quarter of that."""
+"""Time between two readings of the rings.
+
+The rings hold 2 s, and a quarter of that in a fast lockstep run.
+"""
 SHOWN_S = 10.0
-"""Simulated time that a plot shows."""
+"""Simulated time that a plot covers."""
 MOST_S = 600.0
-"""Longest time kept before or after a moment: all of it is in memory."""
+"""Longest time that can be captured before or after a trigger, because all of it is in memory."""
 
 
 def watch(
@@ -37,21 +40,21 @@ def watch(
     after: str = option("--after TIME", "with --when: simulated time to save after it", "1s"),
     out: Path | None = option("--out FILE", "with --when: CSV file; default: RACK-TICK.csv"),
     every: str = option(
-        "--every TIME", "simulated time between two lines; 0s: a line a message", "0.1s"
+        "--every TIME", "simulated time between two lines; 0s for a line per message", "0.1s"
     ),
     as_json: Json = False,
 ) -> None:
     r"""Show signals of a running rack until its run is over, or until Ctrl-C.
 
-    A signal is a field of a mailbox ('rack mailbox RACK' lists those), or one number of it. On a
-    terminal it is plotted, if plotext is there (pip install 'nasrem-rack[live]'). Otherwise each
-    line has the time, s, and the values; with --json each line is a document.
+    A signal is a field of a mailbox ('rack mailbox RACK' lists the mailboxes), or one number of a
+    field. On a terminal it is plotted, if plotext is installed (pip install 'nasrem-rack[live]').
+    Otherwise each line has the time in s and the values; with --json each line is a document.
 
-    With --when it waits for a moment, and saves what was around it: every message, none left out.
-    Watching reads the rings that the recorder reads: it costs the rack no deadline.
+    With --when the command waits until a condition holds, and saves every message in a window
+    around that tick. Watching reads the same rings as the recorder, and costs the rack no deadline.
 
-    Exit status: 0 shown, or saved whole; 1 there is no such rack, messages were lost, or the run
-    ended before the condition held; 2 usage.
+    Exit status: 0 shown, or saved without a gap; 1 there is no such rack, messages were lost, or
+    the run ended before the condition held; 2 usage.
 
     \b
     Examples:
@@ -68,16 +71,16 @@ def watch(
         raise Failure("--out needs --when; give both, or neither", 2)
     segment = Segment.attach(rack)
     boxes = segment.layout.mailboxes
-    shown = [Signal.of(name, boxes) for name in signals]
+    shown_signals = [Signal.of(name, boxes) for name in signals]
     if when is None:
-        _show(segment, shown, every_s, as_json)
+        _show(segment, shown_signals, every_s, as_json)
         return
     _check_writable(out or Path(f"{rack}.csv"))
     trigger = Trigger.of(when, boxes)
     ticks_before, ticks_after = (
         round(s * 1e9 / segment.layout.clock_ns) for s in (before_s, after_s)
     )
-    strip = Strip(segment, shown, ticks_before + ticks_after, [trigger.signal])
+    strip = Strip(segment, shown_signals, ticks_before + ticks_after, [trigger.signal])
     tick = _await_moment(segment, strip, trigger, ticks_after)
     path = out or Path(f"{rack}-{tick}.csv")
     rows = strip.table(tick - ticks_before, tick + ticks_after)
@@ -91,17 +94,18 @@ def watch(
 
 
 def _seconds(option: str, text: str) -> float:
+    """Parse the time of an option, s. Raises `Failure`."""
     seconds = -1.0
     with suppress(ValueError):
         seconds = as_seconds(text)
     if not 0.0 <= seconds <= MOST_S:
-        why = f"not a time; permitted: as in 0.5s or 20ms, at most {MOST_S:g}s"
+        why = f"must be a time, as in 0.5s or 20ms, of at most {MOST_S:g}s"
         raise Failure(f"{option} {text}: {why}", 2)
     return seconds
 
 
 def _check_writable(path: Path) -> None:
-    """Raise `OSError` where a file cannot be written, before the moment: afterwards it is gone."""
+    """Raise `OSError` if a file cannot be written, before the captured messages would be lost."""
     is_new = not path.exists()
     with path.open("a"):
         pass
@@ -131,15 +135,23 @@ def _show(segment: Segment, signals: Sequence[Signal], every_s: float, as_json: 
 
 
 def _await_moment(segment: Segment, strip: Strip, trigger: Trigger, after: int) -> int:
-    """Return the tick at which a condition first holds, once the `after` ticks behind it are there.
-    Raises `Failure` when the run ends before.
+    """Wait for the first tick at which a condition holds, and `after` more ticks.
+
+    Args:
+        segment: The rack.
+        strip: Messages of the signals, which this function keeps up to date.
+        trigger: The condition.
+        after: Number of ticks to wait for afterwards.
+
+    Raises:
+        Failure: The run ends first.
     """
     tick = -1
     for _ in looks(segment, LOOK_S):
         for written in strip.take():
             if tick < 0 and written.mailbox == trigger.signal.mailbox:
-                held = written.ticks[trigger.holds(written.messages)]
-                tick = int(held[0]) if len(held) else -1
+                holding_ticks = written.ticks[trigger.holds(written.messages)]
+                tick = int(holding_ticks[0]) if len(holding_ticks) else -1
         if tick >= 0 and segment.words[System.TICK] > tick + after + strip.settles:
             break
     if tick < 0:

@@ -1,3 +1,4 @@
-"""Shared by all commands: arguments, answers, tables, progress, signals. Nothing here knows of
-runs.
+"""Shared by all commands: arguments, answers, tables, progress, signals.
+
+Nothing in this package knows about runs.
 """

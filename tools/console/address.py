@@ -1,4 +1,4 @@
-"""Racks on other machines as users name them, and operators as those racks know them."""
+"""Addresses of racks on other machines, and the identity of an operator."""
 
 from __future__ import annotations
 
@@ -10,13 +10,18 @@ from rack.backplane.rack_name import RACK_NAME
 from rack.tools.console.answer import Failure
 
 PORT = 7447
+"""Default port of a rack's network adapter."""
 OPERATOR = "operator"
+"""Default name of an operator."""
 _ADDRESS = re.compile(rf"(\[[0-9a-fA-F:.]+\]|[A-Za-z0-9._-]+)(?::([0-9]{{1,5}}))?/({RACK_NAME})")
 
 
 class Operator(NamedTuple):
-    """Who sets an emergency stop: a name as in `adapter.lan.estop_from`, and the folder with its
-    certificates; empty: none.
+    """Identity of the person who sets an emergency stop.
+
+    Attributes:
+        name: Name as in `adapter.lan.estop_from`.
+        certificates: Folder with the operator's certificates. Empty for none.
     """
 
     name: str = OPERATOR
@@ -24,11 +29,18 @@ class Operator(NamedTuple):
 
     @classmethod
     def of(cls, name: str, certificates: str) -> Operator:
-        """Return the operator by the options of a command. Raises `Failure`."""
+        """Check the options of a command and return the operator.
+
+        Args:
+            name: Value of --as.
+            certificates: Value of --certificates.
+
+        Raises:
+            Failure: The name is invalid, or the folder does not exist.
+        """
         if re.fullmatch(RACK_NAME, name) is None:
             raise Failure(
-                f'--as = "{name}": not a name; permitted: small letters, digits, "-" and "_", at'
-                " most 40",
+                f'--as = "{name}": must be at most 40 small letters, digits, "-" and "_"',
                 2,
             )
         if certificates and not Path(certificates).is_dir():
@@ -37,8 +49,9 @@ class Operator(NamedTuple):
 
 
 class RackAddress(NamedTuple):
-    """A rack on another machine: the host and port at which it listens, and its name. An IPv6
-    address has its brackets.
+    """A rack on another machine: host and port at which it listens, and its name.
+
+    An IPv6 address has its brackets.
     """
 
     host: str
@@ -47,19 +60,18 @@ class RackAddress(NamedTuple):
 
     @classmethod
     def of(cls, text: str) -> RackAddress:
-        """Return the address in HOST[:PORT]/RACK. Raises `Failure`."""
-        found = _ADDRESS.fullmatch(text)
-        if found is None or not 0 < int(found[2] or PORT) < 1 << 16:
+        """Parse HOST[:PORT]/RACK. Raises `Failure`."""
+        match = _ADDRESS.fullmatch(text)
+        if match is None or not 0 < int(match[2] or PORT) < 1 << 16:
             raise Failure(
-                f'RACK = "{text}": not a rack; permitted: RACK, or HOST[:PORT]/RACK, as in'
-                " 10.0.0.5/cell",
+                f'RACK = "{text}": must be RACK or HOST[:PORT]/RACK, as in 10.0.0.5/cell',
                 2,
             )
-        return cls(found[1], int(found[2] or PORT), found[3])
+        return cls(match[1], int(match[2] or PORT), match[3])
 
     @property
     def at(self) -> str:
-        """Host and port as users write them."""
+        """Host and port as users write them: the default port is left out."""
         return self.host if self.port == PORT else f"{self.host}:{self.port}"
 
     def __str__(self) -> str:

@@ -1,4 +1,4 @@
-"""Shared by all commands: the printing of an answer, and failure."""
+"""Prints the answers of commands, and ends a command that fails."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from rack.boards.errors import Failure as Failure
 from rack.boards.errors import one_line
 
 Document = dict[str, Any]
-"""Plain data, as `--json` prints it and a run's folder holds it."""
+"""Plain data, as `--json` prints it and as the files of a run hold it."""
 MAX_LINE = 1300
-"""Characters of one line of an error message, at most."""
+"""Maximum number of characters in one line of an error message."""
 
 
 @contextmanager
 def as_failure() -> Iterator[None]:
-    """Raise as `Failure`, with its exit status, what the project raises on purpose."""
+    """Convert the errors of backplane and levels to `Failure`, with its exit status."""
     try:
         yield
     except Exception as error:
@@ -33,7 +33,7 @@ def as_failure() -> Iterator[None]:
 
 
 def write_file(path: Path, text: str) -> None:
-    """Write a file of an answer; whatever has its name is replaced, never opened."""
+    """Write a file of an answer by replacing whatever has its name. That file is never opened."""
     unfinished = path.with_name(f"{path.name}.unfinished")
     unfinished.unlink(missing_ok=True)
     unfinished.write_text(text, encoding="utf-8")
@@ -41,17 +41,23 @@ def write_file(path: Path, text: str) -> None:
 
 
 def write_json(path: Path, document: Any) -> None:
-    """Write a document as a file, as `write_file` does."""
+    """Write a document as a JSON file, in the way of `write_file`."""
     write_file(path, encode_json(document, indent=2) + "\n")
 
 
 def print_json(document: Any) -> None:
-    """Print the answer to --json."""
+    """Print the answer to `--json`."""
     print(encode_json(document, indent=2))
 
 
 def print_answer(document: Any, text: str | Iterable[str], as_json: bool) -> None:
-    """Print an answer: as one JSON document, or as text for people, given whole or as lines."""
+    """Print the answer of a command.
+
+    Args:
+        document: The answer as plain data.
+        text: The same for people, whole or as lines.
+        as_json: True to print the document, and nothing else.
+    """
     if as_json:
         print_json(document)
     elif isinstance(text, str):
@@ -61,9 +67,7 @@ def print_answer(document: Any, text: str | Iterable[str], as_json: bool) -> Non
 
 
 def fail(reason: str, status: int) -> NoReturn:
-    """End the command: print the reason on stderr and, with --json, as a JSON document on
-    stdout.
-    """
+    """End the command with a reason on stderr, and with --json as a JSON document on stdout too."""
     lines = [
         line if line.isprintable() and len(line) <= MAX_LINE else one_line(line, MAX_LINE)
         for line in reason.splitlines()

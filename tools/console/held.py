@@ -1,4 +1,4 @@
-"""A rack that is held between two ticks: what it is asked to do waits until it goes on."""
+"""Describes a rack that is held between two ticks, where requests wait."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ if TYPE_CHECKING:
 
 
 def waits(segment: Segment) -> str:
-    """Return that a request waits, and until when; empty: the rack is not held."""
+    """Describe how long a request to the rack must wait. Empty if the rack is not held."""
     tick = segment.words[System.HELD] - 1
     if tick < 0:
         return ""
-    return f"waits: the rack is held before tick {tick}; 'rack step {segment.rack}' lets it go on"
+    return f"waits: the rack is held before tick {tick}; 'rack step {segment.rack}' continues it"

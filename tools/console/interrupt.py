@@ -1,10 +1,9 @@
-"""SIGINT, SIGTERM and SIGHUP end a command within 2 s, with exit status 128 + signal, and nothing
-left behind.
+"""SIGINT, SIGTERM and SIGHUP end a command within 2 s, with exit status 128 + signal.
 
-A command with nothing to finish ends inside the signal handler. Python's own way, an exception
-raised there, was rejected: it may strike after a segment is created and before its owner is
-recorded, and libraries turn it into errors of their own while they are being imported. A command
-with something to finish uses `orderly`, and gets BOUND_S.
+They leave no process and no segment behind. A command with nothing to finish ends inside the signal
+handler. Python's own way, an exception raised there, was rejected: it may strike after a segment
+has been created and before its owner has been recorded, and libraries that are being imported turn
+it into other errors. A command with something to finish uses `stop_orderly`, and gets `BOUND_S`.
 """
 
 from __future__ import annotations
@@ -26,21 +25,28 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 BOUND_S = 1.7
 """Longest time from the first signal to the end of the process."""
 GONE_S = 0.25
-"""Longest wait for killed children."""
+"""Longest wait for killed children to end."""
 SHOW_CURSOR = b"\x1b[?25h\n"
+"""Control sequence that shows the cursor of a terminal."""
 
 
 class Interrupted(BaseException):
-    """Raised in a waiting command, so that it withdraws its request."""
+    """Raised in a waiting command so that it withdraws its request."""
 
 
 class _Way(NamedTuple):
+    """Reaction to the first signal, with a message for a command that does not end in time."""
+
     stop: Callable[[], object]
     unfinished: str = ""
 
 
 class Interrupt:
-    """The signals of this process. `number` is the first one received, 0 before that."""
+    """The signals of this process.
+
+    Attributes:
+        number: Number of the first signal received. 0 before that.
+    """
 
     def __init__(self) -> None:
         self.number = 0
@@ -48,15 +54,16 @@ class Interrupt:
 
     @property
     def name(self) -> str:
-        """Name of the signal received, such as SIGINT; empty before that."""
+        """Name of the signal received, such as SIGINT. Empty before that."""
         return signal.Signals(self.number).name if self.number else ""
 
     def catch(self) -> None:
-        """Handle the signals. Until then they kill the process, with the same exit status for a
-        shell.
+        """Install the handlers.
+
+        Before that a signal kills the process, with the same exit status.
         """
         for number in SIGNALS:
-            # Under nohup a command outlives its terminal.
+            # Leave SIGHUP ignored under nohup, so that the command outlives its terminal.
             if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
                 signal.signal(number, self._receive)
         signal.signal(signal.SIGALRM, lambda number, frame: self.end())
@@ -65,11 +72,13 @@ class Interrupt:
     def orderly(
         self, stop: Callable[[], object] = lambda: None, unfinished: str = ""
     ) -> Iterator[None]:
-        """In this context the first signal calls `stop`, in its handler; the command then ends by
-        itself.
+        """Let the first signal call a function in its handler. The command then ends by itself.
 
-        It has `BOUND_S` for that; otherwise `unfinished` is printed, which says what the user can
-        do.
+        Args:
+            stop: Called in the signal handler, or at once if a signal has been received already.
+            unfinished: Printed if the command has not ended within `BOUND_S`. Tells the user what
+                to
+                do.
         """
         self._ways.append(_Way(stop, unfinished))
         try:
@@ -80,18 +89,17 @@ class Interrupt:
             self._ways.pop()
 
     def at_once(self) -> AbstractContextManager[None]:
-        """In this context a signal ends the process in its handler, even inside `orderly`."""
+        """Let a signal end the process in its handler, even inside `stop_orderly`."""
         return self.orderly(self.end)
 
     def raising(self) -> AbstractContextManager[None]:
-        """In this context the first signal raises `Interrupted`: for waits, and where contexts
-        clean up files.
-        """
+        """Let the first signal raise `Interrupted`, for waits and where contexts clean up files."""
         return self.orderly(_interrupted)
 
     def settle(self) -> None:
-        """End the process with the signal's exit status, if one was received. Call it when the
-        command has finished.
+        """End the process with the signal's exit status if one was received.
+
+        Call it when the command has finished.
         """
         if self.number:
             for stream in (sys.stdout, sys.stderr):
@@ -101,24 +109,26 @@ class Interrupt:
             self.end()
 
     def end(self) -> NoReturn:
-        """Kill this process's children, remove its racks, and end at once."""
+        """Kill the children of this process, remove its racks, and end at once."""
         try:
             signal.pthread_sigmask(signal.SIG_BLOCK, {*SIGNALS, signal.SIGALRM})
             family = [pid for pid in descendants(os.getpid(), os.getsid(0)) if not _cleans_up(pid)]
             for step in (partial(_kill, family), partial(_remove_racks, family), self._take_leave):
-                # A step that fails must not prevent the others, nor the end.
+                # An error in one step must not prevent the other steps or the exit.
                 with suppress(Exception):
                     step()
         finally:
             os._exit(128 + self.number)
 
     def _take_leave(self) -> None:
+        """Restore the cursor of the terminal, and print the message about unfinished work."""
         if os.isatty(1):
             os.write(1, SHOW_CURSOR)
         if unfinished := self._ways[-1].unfinished:
             os.write(2, f"{unfinished}\n".encode())
 
     def _receive(self, number: int, frame: FrameType | None) -> None:
+        """Handle a signal. The second one ends the process at once."""
         if number == signal.SIGHUP:
             _leave_terminal()
         if self.number:
@@ -129,12 +139,13 @@ class Interrupt:
 
 
 INTERRUPT = Interrupt()
-"""The only one: signals belong to the process."""
+"""The only instance, because signals belong to the process."""
 
 
 def _cleans_up(pid: int) -> bool:
-    """Say whether a process is Python's own that removes the semaphores of a pool of processes: it
-    does so, and ends, when this process has ended.
+    """Return whether a process is Python's resource tracker.
+
+    It removes the semaphores of a process pool when this process has ended, and must not be killed.
     """
     with suppress(OSError):
         return b"multiprocessing.resource_tracker" in Path(f"/proc/{pid}/cmdline").read_bytes()
@@ -146,7 +157,7 @@ def _interrupted() -> None:
 
 
 def _leave_terminal() -> None:
-    """Discard what is still printed: writing to a terminal that is gone is an error."""
+    """Discard further output, because writing to a closed terminal is an error."""
     for fd in (1, 2):
         with suppress(OSError):
             if stat.S_ISCHR(os.fstat(fd).st_mode):
@@ -156,8 +167,9 @@ def _leave_terminal() -> None:
 
 
 def _kill(family: list[int]) -> None:
-    """Kill every descendant in this session and wait for it; a viewer window has its own session
-    and stays.
+    """Kill every descendant in this session and wait for its end.
+
+    A viewer window has its own session and stays open.
     """
     for pid in family:
         with suppress(ProcessLookupError):
@@ -166,7 +178,7 @@ def _kill(family: list[int]) -> None:
 
 
 def await_ends(pids: Iterable[int], bound_s: float) -> None:
-    """Wait until processes have ended, for so long at most."""
+    """Wait until processes have ended, for at most `bound_s` in all."""
     deadline = time.monotonic() + bound_s
     for pid in pids:
         with suppress(ProcessLookupError):
@@ -178,10 +190,13 @@ def await_ends(pids: Iterable[int], bound_s: float) -> None:
 
 
 def descendants(pid: int, session: int | None = None) -> Iterator[int]:
-    """Yield the processes that descend from one, the youngest generation first; with a `session`,
-    only those in it.
+    """Yield the descendants of a process, the youngest generation first.
+
+    Args:
+        pid: The process.
+        session: Only processes of this session. None for all.
     """
-    # A process that ends meanwhile leaves nothing to read.
+    # The files of a process that has ended since cannot be read.
     children: list[int] = []
     with suppress(OSError):
         for thread in Path(f"/proc/{pid}/task").iterdir():
@@ -194,8 +209,9 @@ def descendants(pid: int, session: int | None = None) -> Iterator[int]:
 
 
 def _remove_racks(killed: list[int]) -> None:
-    # Looked up, not imported: in a handler a module may be half imported. Not loaded, it has made
-    # no racks.
+    """Remove the racks of this process, whose `killed` children cannot do so."""
+    # Look the module up instead of importing it: a signal handler may run in the middle of an
+    # import. If it is not loaded, this process has not made any racks.
     remove_own = getattr(sys.modules.get("rack.boards.crate.clean"), "remove_own", None)
     if remove_own is not None:
         remove_own(killed=killed)

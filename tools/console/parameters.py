@@ -1,4 +1,4 @@
-"""Arguments and options that several commands have."""
+"""Arguments and options that several commands share."""
 
 from __future__ import annotations
 
@@ -11,60 +11,66 @@ from rack.tools.console.answer import Failure
 
 
 def option(declared: str, meaning: str, default: Any = None, **more: Any) -> Any:
-    """Return an option of a command, the default value of a parameter of its function.
+    """Declare an option of a command, as the default value of a parameter of its function.
 
     Args:
-        declared: Its name, and that of its value if it takes one, as in "--seconds S".
-        meaning: What `--help` says of it.
-        default: Its value if it is not given; `...` if it must be given.
-        more: Whatever else `typer.Option` takes, such as `min` and `max`.
+        declared: Name of the option, and of its value if it takes one, as in "--seconds S".
+        meaning: Help text.
+        default: Value if the option is absent. `...` if it is required.
+        more: Further arguments of `typer.Option`, such as `min` and `max`.
     """
     name, _, metavar = declared.partition(" ")
     return typer.Option(default, name, metavar=metavar or None, help=meaning, **more)
 
 
 def argument(name: str, meaning: str, default: Any = ..., **more: Any) -> Any:
-    """Return an argument of a command, which must be given unless it has a default; as `option`."""
+    """Declare an argument of a command, as the default value of a parameter of its function.
+
+    Args:
+        name: Name in the help text.
+        meaning: Help text.
+        default: Value if the argument is absent. `...` if it is required.
+        more: Further arguments of `typer.Argument`.
+    """
     return typer.Argument(default, metavar=name, help=meaning, **more)
 
 
 def config_names(start: str) -> list[str]:
-    """Return the shipped configs whose names begin with `start`, for shell completion."""
+    """List the shipped configs whose names begin with `start`, for shell completion."""
     from rack.boards.config import names
 
     return [name for name in names() if name.startswith(start)]
 
 
 def rack_names(start: str) -> list[str]:
-    """Return the racks in shared memory whose names begin with `start`, for shell completion."""
+    """List the racks in shared memory whose names begin with `start`, for shell completion."""
     from rack.backplane.segment import racks
 
     return [name for name in racks() if name.startswith(start)]
 
 
 def check_timeout(timeout: float | None, wait: bool) -> None:
-    """Raise `Failure` for --timeout without --wait."""
+    """Raise `Failure` if --timeout is given without --wait."""
     if timeout is not None and not wait:
         raise Failure("--timeout needs --wait; give both, or neither", 2)
 
 
 def named(rack: str | None) -> str | None:
-    """Return the name of a rack. Raises `Failure` when it is empty."""
+    """Check the name of a rack. Raises `Failure` if it is empty."""
     if rack == "":
-        raise Failure(
-            'RACK = "": empty; permitted: a running rack by name, as "rack list" shows it', 2
-        )
+        raise Failure('RACK = "": must be the name of a running rack, as "rack list" shows it', 2)
     return rack
 
 
 def named_here(rack: str | None) -> str | None:
-    """Return the name of a rack on this machine. Raises `Failure` for one on another, where this
-    command is needed.
+    """Check the name of a rack.
+
+    Raises `Failure` for an empty one and for a rack on another machine.
     """
     if rack is not None and "/" in rack:
         raise Failure(
-            f"RACK = {rack}: this command works on the rack's own machine alone, as in: ssh HOST"
-            " rack status; from another machine only: rack estop",
+            f"RACK = {rack}: run this command on the rack's machine, as in: ssh HOST rack status;"
+            " only 'rack estop' works from another machine",
             2,
         )
     return named(rack)
@@ -97,7 +103,7 @@ Anyway = Annotated[
     bool,
     typer.Option(
         "--anyway",
-        help="repeat a run whose code or files have changed since; digests may differ",
+        help="repeat a run although its code or files have changed since; digests may differ",
     ),
 ]
 View = Annotated[bool, typer.Option("--view", help="open the viewer on the running rack")]

@@ -1,5 +1,7 @@
-"""Pictures by matplotlib, as PNG and SVG. It is an extra, and takes a second to import: only what
-draws may import it, after `can_draw`.
+"""Draws pictures with matplotlib, as PNG and SVG.
+
+matplotlib is an optional dependency and takes a second to import. Only modules that draw may import
+it, after `can_draw`.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ NO_PICTURES = "no pictures: they need matplotlib: pip install 'nasrem-rack[chart
 
 
 def can_draw() -> bool:
-    """Say whether matplotlib is there; `NO_PICTURES` says what to do otherwise."""
+    """Return whether matplotlib is installed. If not, `NO_PICTURES` tells the user what to do."""
     return find_spec("matplotlib") is not None
 
 
@@ -27,8 +29,13 @@ def can_draw() -> bool:
 def picture(
     paths: Sequence[Path], width_in: float, height_in: float, **settings: Any
 ) -> Iterator[Figure]:
-    """Give an empty figure to draw on, and save it when the context ends; equal figures make equal
-    files.
+    """Provide an empty figure, and save it when the context ends. Equal figures make equal files.
+
+    Args:
+        paths: Files to write, with endings in `PICTURE_FORMATS`.
+        width_in: Width in inches.
+        height_in: Height in inches.
+        settings: Further arguments of `Figure`.
     """
     from matplotlib import rc_context
     from matplotlib.figure import Figure
@@ -42,5 +49,5 @@ def picture(
 
 
 def paths_of(stem: Path) -> list[Path]:
-    """Return the paths of a picture: `stem`.png and `stem`.svg."""
+    """List the paths of a picture: `stem`.png and `stem`.svg."""
     return [stem.with_name(f"{stem.name}.{kind}") for kind in KINDS]

@@ -1,4 +1,4 @@
-"""Progress: a bar on a terminal, plain lines elsewhere, nothing with --json."""
+"""Shows progress: a bar on a terminal, plain lines elsewhere, nothing with --json."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from rich.progress import Progress as RichProgress
 from rack.tools.console.tables import console
 
 PATIENCE_S = 2.0
-"""Time between two lines of the progress of reading."""
+"""Least time between two lines about the progress of reading."""
 
 
 class Progress:
-    """The progress of a series of runs, measured in the seconds that each is expected to take.
+    """Progress of a series of runs, measured in the seconds that each is expected to take.
 
     It shows a `bar`, or prints lines, or neither.
     """
@@ -28,7 +28,7 @@ class Progress:
         self._task = self._bar.add_task("", total=None)
 
     def total(self, seconds: float) -> None:
-        """Set the expected time of the whole series."""
+        """Set the expected duration of the whole series, s."""
         self._bar.update(self._task, total=seconds)
         self._print(f"about {seconds / 60.0:.0f} minutes")
 
@@ -38,8 +38,12 @@ class Progress:
         self._print(text)
 
     def end(self, seconds: float, ended: str = "done", shortfalls: Sequence[str] = ()) -> None:
-        """Advance by the expected `seconds` of a run; show how it ended, on a terminal only its
-        shortfalls.
+        """Advance by a run that has ended.
+
+        Args:
+            seconds: Time that the run was expected to take.
+            ended: How it ended. Not shown on a terminal.
+            shortfalls: Its failures, one line each.
         """
         self._bar.update(self._task, advance=seconds)
         if not self._bar.disable:
@@ -55,7 +59,7 @@ class Progress:
 
 @contextmanager
 def progress_for(silent: bool) -> Iterator[Progress]:
-    """Give the progress display that suits stdout."""
+    """Provide the progress display that suits stdout, or a silent one."""
     terminal = console()
     if silent or not terminal.is_terminal:
         yield Progress(prints_lines=not silent)
@@ -71,15 +75,16 @@ def progress_for(silent: bool) -> Iterator[Progress]:
 
 
 def reading_progress(silent: bool, what: str = "reading the run") -> Callable[[float], None]:
-    """Return a function that takes the part of the work that is done, 0 to 1, and prints it on
-    stderr now and then.
-    """
-    shown = time.monotonic()
+    """Return a function that prints the progress of reading on stderr from time to time.
 
-    def show(part: float) -> None:
-        nonlocal shown
-        if not silent and time.monotonic() - shown > PATIENCE_S:
-            shown = time.monotonic()
-            print(f"{what}: {part:.0%}", file=sys.stderr, flush=True)
+    The function takes the fraction of the work that is done, 0 to 1.
+    """
+    last_shown = time.monotonic()
+
+    def show(fraction: float) -> None:
+        nonlocal last_shown
+        if not silent and time.monotonic() - last_shown > PATIENCE_S:
+            last_shown = time.monotonic()
+            print(f"{what}: {fraction:.0%}", file=sys.stderr, flush=True)
 
     return show

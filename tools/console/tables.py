@@ -1,5 +1,6 @@
-"""Tables and their cells as text: they fit the terminal; in a pipe, and as Markdown, nothing is cut
-or coloured.
+"""Formats tables and their cells as text.
+
+On a terminal they fit its width. In a pipe, and as Markdown, they are neither cut nor coloured.
 """
 
 from __future__ import annotations
@@ -14,22 +15,26 @@ from rich.table import Table
 from rich.text import Text
 
 PIPE_WIDTH = 120
-"""Width of the views that always have one, such as `rack status`, where stdout is no terminal."""
+"""Width of views that always have one, such as `rack status`, when stdout is not a terminal."""
 GAP = 2
-"""Spaces between columns."""
+"""Number of spaces between columns."""
 UNLIMITED = 1_000_000
+"""Width of a table that is neither cut nor wrapped."""
 
 
 def console() -> Console:
     """Return the console on stdout."""
-    found = Console()
-    return found if found.is_terminal else Console(width=PIPE_WIDTH)
+    stdout_console = Console()
+    return stdout_console if stdout_console.is_terminal else Console(width=PIPE_WIDTH)
 
 
 def terminal_width() -> int | None:
-    """Return the width of the terminal on stdout, in characters; None where it is no terminal."""
-    found = Console()
-    return found.width if found.is_terminal else None
+    """Return the width of the terminal on stdout, in characters.
+
+    None if stdout is not a terminal.
+    """
+    stdout_console = Console()
+    return stdout_console.width if stdout_console.is_terminal else None
 
 
 def table(
@@ -38,9 +43,14 @@ def table(
     width: int | None = None,
     dropped: Sequence[str] = (),
 ) -> Iterator[str]:
-    """Yield the lines of a table, as plain text; columns of numbers are right-aligned.
+    """Yield the lines of a table as plain text. Columns of numbers are right-aligned.
 
-    To fit `width` it leaves out columns named in `dropped`, in that order, then wraps long cells.
+    Args:
+        head: Names of the columns.
+        rows: Cells of each row.
+        width: Maximum width. None for no limit.
+        dropped: Columns to leave out, in this order, until the table fits. Then long cells are
+            wrapped.
     """
     printer = Console(file=StringIO(), width=width or UNLIMITED, color_system=None)
     with printer.capture() as captured:
@@ -51,17 +61,24 @@ def table(
 def fitted(
     head: Sequence[str], rows: Sequence[Sequence[str]], dropped: Sequence[str] = ()
 ) -> Iterator[str]:
-    """Yield the lines of a table that fits the terminal on stdout; where that is none, whole."""
+    """Yield the lines of a table that fits the terminal on stdout. In a pipe it is complete.
+
+    Args:
+        head: Names of the columns.
+        rows: Cells of each row.
+        dropped: Columns that a narrow terminal leaves out, in this order.
+    """
     return table(head, rows, terminal_width(), dropped)
 
 
 def fitted_records(
     records: Sequence[Mapping[str, object]], dropped: Sequence[str] = ()
 ) -> Iterator[str]:
-    """Yield the lines of such a table, with a row for each record, at least one, and a column for
-    each key.
+    """Yield the lines of a table like `format_fitted_table`, with a row for each record.
+
+    The keys of the first record are the columns.
     """
-    return fitted([*records[0]], [[*map(str, one.values())] for one in records], dropped)
+    return fitted([*records[0]], [[*map(str, record.values())] for record in records], dropped)
 
 
 def grid(
@@ -71,35 +88,41 @@ def grid(
     dropped: Sequence[str] = (),
     style: Callable[[str, str], str] = lambda column, text: "",
 ) -> Table:
-    """Return the same table for rich to draw; `style` gives the style of a cell by its column and
-    text.
+    """Return a table for rich to draw.
+
+    Args:
+        head: Names of the columns.
+        rows: Cells of each row.
+        width: Maximum width.
+        dropped: Columns to leave out, in this order, until the table fits.
+        style: Returns the style of a cell, given its column and text.
     """
     columns = list(zip(head, *rows, strict=True))
     for name in dropped:
         if sum(max(map(len, column)) for column in columns) + GAP * (len(columns) - 1) <= width:
             break
         columns = [column for column in columns if column[0] != name]
-    drawn = Table(box=None, pad_edge=False, padding=(0, GAP, 0, 0), header_style="dim")
+    rich_table = Table(box=None, pad_edge=False, padding=(0, GAP, 0, 0), header_style="dim")
     for name, *cells in columns:
         is_right = bool(cells) and all(map(is_number, cells))
-        drawn.add_column(Text(name), justify="right" if is_right else "left", overflow="fold")
+        rich_table.add_column(Text(name), justify="right" if is_right else "left", overflow="fold")
     for row in zip(*(cells for _, *cells in columns), strict=True):
-        drawn.add_row(
+        rich_table.add_row(
             *(
                 Text(text, style=style(column[0], text))
                 for column, text in zip(columns, row, strict=True)
             )
         )
-    return drawn
+    return rich_table
 
 
 def is_number(cell: str) -> bool:
-    """Return whether a cell holds a number, or nothing."""
+    """Return whether a cell holds a number or is empty."""
     return not cell.strip("0123456789.-+e")
 
 
 def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
-    """Yield the lines of a table in Markdown, each column as wide as its widest cell."""
+    """Yield the lines of a Markdown table, each column as wide as its widest cell."""
     widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
     for number, row in enumerate((head, *rows)):
         yield (
@@ -110,13 +133,16 @@ def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterat
 
 
 Cell = str | float | None
-"""Text, or a number without trailing zeros; None for "-"."""
+"""A text or a number. Numbers are shown without trailing zeros, None as "-"."""
 
 
 @dataclass(frozen=True)
 class TextTable:
-    """A table as data: of each row the cells by column. `dropped` are columns that a narrow
-    terminal leaves out, the first of them first.
+    """A table as data.
+
+    Attributes:
+        records: Cells of each row, by column.
+        dropped: Columns that a narrow terminal leaves out, in this order.
     """
 
     records: Sequence[Mapping[str, Cell]]
@@ -124,28 +150,28 @@ class TextTable:
 
     @property
     def head(self) -> list[str]:
-        """The names of the columns; none without a row."""
+        """Names of the columns. Empty for a table without rows."""
         return [*self.records[0]] if self.records else []
 
     @property
     def rows(self) -> list[list[str]]:
-        """The cells as text."""
+        """Cells as text, row by row."""
         return [[cell_text(cell) for cell in record.values()] for record in self.records]
 
 
 def cell_text(cell: Cell) -> str:
-    """Return a cell as text."""
+    """Format a cell."""
     if cell is None:
         return "-"
     return f"{cell:g}" if isinstance(cell, float) else str(cell)
 
 
 Blocks = Iterator[str | TextTable]
-"""A text for people, line by line, with tables in it; a line that begins with "#" is a title."""
+"""A text for people, line by line, with tables in it. A line that begins with "#" is a title."""
 
 
 def render_markdown(blocks: Iterable[str | TextTable]) -> str:
-    """Return a text as Markdown, with all columns."""
+    """Format a text as Markdown, with all columns of its tables."""
     lines: list[str] = []
     for block in blocks:
         if isinstance(block, TextTable):
@@ -156,7 +182,7 @@ def render_markdown(blocks: Iterable[str | TextTable]) -> str:
 
 
 def render_text(blocks: Iterable[str | TextTable], width: int | None = None) -> Iterator[str]:
-    """Yield the lines of a text, its tables as `table` fits them to `width`."""
+    """Yield the lines of a text. Its tables are fitted to `width`, if given."""
     for block in blocks:
         if isinstance(block, TextTable):
             yield from table(block.head, block.rows, width, block.dropped)
@@ -165,7 +191,7 @@ def render_text(blocks: Iterable[str | TextTable], width: int | None = None) -> 
 
 
 def show_blocks(blocks: Iterable[str | TextTable], terminal: Console) -> None:
-    """Print a text on a terminal: tables show as many columns as fit, and titles are bold."""
+    """Print a text on a terminal. Tables are fitted to its width, and titles are bold."""
     for line in render_text(blocks, terminal.width):
         is_title = line.startswith("#")
         text = line.lstrip("# ") if is_title else line
@@ -173,7 +199,7 @@ def show_blocks(blocks: Iterable[str | TextTable], terminal: Console) -> None:
 
 
 def print_blocks(blocks: Iterable[str | TextTable]) -> None:
-    """Print a text on stdout: as it fits a terminal, or else whole."""
+    """Print a text on stdout, fitted to a terminal or complete in a pipe."""
     terminal = console()
     if terminal.is_terminal:
         show_blocks(blocks, terminal)
@@ -182,15 +208,15 @@ def print_blocks(blocks: Iterable[str | TextTable]) -> None:
 
 
 def decimal(value: float | None, digits: int = 3) -> str:
-    """Return a number with so many decimals; "-" for None."""
+    """Format a number with a fixed number of decimals, or "-" for None."""
     return "-" if value is None else f"{value:.{digits}f}"
 
 
-def figure(found: Mapping[str, Any] | None, key: str) -> str:
-    """Return one figure of a distribution; "-" where there is none."""
-    return "-" if found is None else decimal(found[key])
+def figure(distribution: Mapping[str, Any] | None, key: str) -> str:
+    """Format one figure of a distribution, or "-" if the distribution is None."""
+    return "-" if distribution is None else decimal(distribution[key])
 
 
 def ms(time_ns: float | None) -> str:
-    """Return a time in ms, to the us, without trailing zeros; "-" for None."""
+    """Format a time in ms, to the microsecond, without trailing zeros. "-" for None."""
     return "-" if time_ns is None else f"{time_ns * 1e-6:.3f}".rstrip("0").rstrip(".")

@@ -1,6 +1,6 @@
-"""Build hook of the wheel: adds the package `rack` itself and the module of its command.
+"""Build hook of the wheel: adds the package `rack` and the module of its command.
 
-An editable install has links to both in `.venv/src`; copies would hide these.
+An editable install has links to both in `.venv/src`, which copies would hide.
 """
 
 from __future__ import annotations

@@ -1,5 +1,7 @@
-"""The `rack` command. This module stands outside the package `rack`, so that it can tell when
-another distribution's package of that name is imported in its place.
+"""Entry of the `rack` command.
+
+This module is outside the package `rack`, so that it can detect that another distribution's package
+`rack` is imported instead.
 """
 
 from __future__ import annotations
@@ -11,7 +13,7 @@ from pathlib import Path
 
 
 def main() -> None:
-    """Run the command line of `rack`, or say in one line which package was imported instead."""
+    """Run the command line of `rack`, or exit with one line that names the wrong package."""
     place = _find_package()
     if "nasrem-rack" not in place.read_text():
         sys.exit(f"rack: {place} is not nasrem-rack's package `rack`: {_remedy()}")
@@ -21,7 +23,7 @@ def main() -> None:
 
 
 def _find_package() -> Path:
-    """Return the file of the package `rack` that is imported first; not one line of it runs."""
+    """Find the file of the package `rack` that would be imported, without running any of it."""
     spec = find_spec("rack")
     assert spec is not None
     assert spec.origin is not None
@@ -29,7 +31,7 @@ def _find_package() -> Path:
 
 
 def _remedy() -> str:
-    """Return what removes the other package: one installed over ours, or one found before it."""
+    """Return what removes the other package, which is installed over ours or found before it."""
     try:
         version("rack")
     except PackageNotFoundError:

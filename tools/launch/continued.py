@@ -1,9 +1,9 @@
-"""A recorded run, run again in lockstep with snapshots on the way: `rack run --from RUN@TIME`, and
-the state of a run at any tick.
+"""Runs a recorded run again in lockstep, up to any tick, with snapshots on the way.
 
-Lockstep is deterministic, so the rack of the run comes to each tick as it did then. What operators
-commanded enters again, and what host boards and other racks sent. Until the tick it goes on
-unchanged: only there may a branch differ.
+`rack run --from RUN@TIME` and `rack rewind` use it. Lockstep is deterministic, so the rack comes to
+each tick in the same state as in the recorded run. Commands of operators are repeated, and messages
+of host boards and other racks are replayed. Up to the tick nothing is changed: a branch may differ
+only from there.
 """
 
 from __future__ import annotations
@@ -47,15 +47,21 @@ WHY_NOT = (
     "the code of a level has changed since, it missed cycles in real time, it does not repeat"
     " itself, or somebody injected a fault or stopped it while it ran"
 )
+"""Possible reasons why a repeated run differs from its recording."""
 
 
 class RunAgain:
-    """The rack of a recorded run, which runs again to any tick. Use it as a context: its snapshots
-    end with it, and with its `crate`.
+    """The rack of a recorded run, which is repeated up to any tick.
 
-    Each tick that was reached has a snapshot, from which later ones are near. A run that continues
-    another one begins with that. `asked` begins what goes wrong, which is a `Failure`. `anyway`:
-    even if its code or files have changed since.
+    Each tick that was reached has a snapshot, from which later ticks are near. A run that continues
+    another run first repeats that one. Use it as a context: its snapshots and its `crate` end with
+    it.
+
+    Args:
+        recording: The run.
+        asked: Beginning of the text of each `Failure`. Empty for the folder of the run.
+        crate: A crate that was started earlier, to save time.
+        anyway: True to repeat the run even if its code or files have changed since.
     """
 
     def __init__(
@@ -69,11 +75,11 @@ class RunAgain:
         self._asked = asked or str(recording.folder)
         self._anyway = anyway
         ran = recording.rack_config
-        # The rack is about to run again, with the levels that its config names.
+        # Make the levels that the config names importable.
         extend_path(ran.python_path)
         check_code(recording, self._asked, anyway)
         self.crate = crate or WarmCrate()
-        # It imports while this process reads the run.
+        # The crate imports them while this process reads the run.
         self.crate.ask(Preload(classes(ran), tuple(sys.path), cell_of(ran)))
         self._has_begun = False
         self._branched_at = continued_at(recording)
@@ -86,7 +92,7 @@ class RunAgain:
 
     @cached_property
     def _parent(self) -> RunAgain | None:
-        """The run that this one continues."""
+        """The run that this one continues. None if it starts from the beginning."""
         if self._branched_at is None:
             return None
         folder = other_run(self.recording.folder, Path("origin"), self._asked)
@@ -94,31 +100,46 @@ class RunAgain:
 
     @cached_property
     def entries(self) -> Mapping[str, Entries] | None:
-        """What host boards and other racks sent in the run; None: its rack has none."""
+        """Messages that host boards and other racks sent in the run.
+
+        None if its rack has neither.
+        """
         run = self.recording
         config = run.rack_config
         return recorded_entries(config, run.folder, self._asked) if config.outside else None
 
     def reach(self, tick: int) -> None:
-        """Have a snapshot before `tick`, in which all is as it was in the run then; note on stderr
-        what is not. Raises `Failure`.
+        """Make a snapshot before `tick`. Differences from the recording are noted on stderr.
+
+        Raises `Failure` if there is none, because a board is lost at that tick.
         """
         if not self._has_begun and self._branched_at not in (None, tick):
-            # From here on all snapshots are of this run, not of the one that it continues.
+            # First reach the branching tick, so that all later snapshots belong to this run.
             self.reach(self._branched_at or 0)
         if self._has_begun and self._nearest(tick) == tick:
             return
         with self.rack_at(tick, SnapshotPolicy(at=tick)) as rack:
-            if unlike := unlike_in(self.recording, rack.segment, tick):
-                self._note_unlike(unlike, tick)
-            said = [e.text for e in rack.events if e.kind == "printed" or e.text.startswith(UNKEPT)]
+            if differing := unlike_in(self.recording, rack.segment, tick):
+                self._note_unlike(differing, tick)
+            notes = [
+                e.text for e in rack.events if e.kind == "printed" or e.text.startswith(UNKEPT)
+            ]
         if self._nearest(tick) != tick:
-            why = said[-1] if said else "a board is lost then; ask for a time at which it is back"
+            why = (
+                notes[-1]
+                if notes
+                else "a board is lost at this time; choose a time when it is back"
+            )
             raise Failure(f"{self._asked}: {why}", 2)
 
     @contextmanager
     def rack_at(self, tick: int, snapshots: SnapshotPolicy | None = None) -> Iterator[Rack]:
-        """Yield the rack as it is when it has run, unchanged, to `tick`."""
+        """Yield the rack after it has run, unchanged, up to `tick`.
+
+        Args:
+            tick: The tick before which the rack stops.
+            snapshots: Which snapshots to keep. None for none.
+        """
         begins = self._begin(tick)
         config = self._own_config(f"at-{tick}")
         with (
@@ -138,24 +159,24 @@ class RunAgain:
             yield rack
 
     def _own_config(self, ending: str) -> RackConfig:
-        """Return the run's own config, with another name: that may be in use."""
+        """Return the config of the run with a unique name, since the original may be in use."""
         config = branched(self.recording)
         return config.model_copy(update={"name": f"{config.name[:16]}-{ending}-{os.getpid()}"})
 
     def beginning(self, tick: int) -> Beginning:
-        """Return what a rack goes on from at `tick`."""
+        """Return the state from which a rack can continue at `tick`."""
         self.reach(tick)
         return replace(self._begin(tick), origin=Origin.at(self.recording, tick))
 
     def levels(self, tick: int) -> dict[str, Document]:
-        """Return the attributes of the levels' own objects before `tick`, by task."""
+        """Return the attributes of the levels' objects before `tick`, by task."""
         self.reach(tick)
         tasks = [task.name for task in self.recording.layout.tasks]
-        shown = {task: self.crate.show(tick, task).attributes for task in tasks}
-        return {task: json.loads(text) for task, text in shown.items() if text}
+        texts = {task: self.crate.show(tick, task).attributes for task in tasks}
+        return {task: json.loads(text) for task, text in texts.items() if text}
 
     def _begin(self, tick: int) -> Beginning:
-        """Return what the run's own rack goes on from to come to `tick`."""
+        """Return the state from which this run is repeated towards `tick`."""
         run = self.recording
         begins = Beginning(crate=self.crate, entries=self.entries)
         if self._has_begun:
@@ -166,26 +187,28 @@ class RunAgain:
             requests = commands_from(run, self._branched_at)
             return replace(begins, continues=continues, requests=requests)
         if ticks_of(run)[0] > max(task.every for task in run.layout.tasks):
-            raise Failure(f"{self._asked}: its beginning was not kept", 2)
+            raise Failure(f"{self._asked}: the beginning of the run was not recorded", 2)
         return replace(begins, requests=recorded_commands(run))
 
     def _continuation(self, tick: int) -> Continuation:
-        """Return the snapshot at `tick` or before, with what the tables hold there."""
+        """Return the newest snapshot up to `tick`, with the number of entries in the tables."""
         ran = self.recording.rack_config
         return Continuation(tick, len(ran.fault), len(ran.command), self._losses)
 
     @cached_property
     def _losses(self) -> tuple[tuple[str, int], ...]:
+        """Boards that died in this run and those it continues, with the ticks."""
         died = (event for event in self.recording.events if event["kind"] == "died")
         earlier = () if self._parent is None else self._parent._losses
         before = (loss for loss in earlier if loss[1] < (self._branched_at or 0))
-        return (*before, *((one["board"], one["tick"]) for one in died))
+        return (*before, *((death["board"], death["tick"]) for death in died))
 
     def _nearest(self, tick: int) -> int:
+        """Return the tick of the newest snapshot up to `tick`."""
         return self.crate.show(tick, "").tick
 
     def _note_unlike(self, unlike: Sequence[str], tick: int) -> None:
-        """Note what is not as recorded, with the first message and field that differ."""
+        """Report on stderr which mailboxes differ from the recording, with the first difference."""
         names = ", ".join(unlike)
         first = ""
         with suppress(Failure), TemporaryDirectory(prefix="rack-") as folder:
@@ -193,8 +216,9 @@ class RunAgain:
         print(f"{self._asked}: {names} are not as recorded: {first}{WHY_NOT}", file=sys.stderr)
 
     def _first_unlike(self, folder: Path, tick: int) -> str:
-        """Return the first message that differs until `tick`, as text, from a record of the rack
-        that runs again into `folder`.
+        """Describe the first message up to `tick` that differs from the recording.
+
+        The rack runs again for this, and is recorded into `folder`.
         """
         config = self._own_config("again")
         begins = self._begin(self._branched_at or 0)
@@ -202,22 +226,24 @@ class RunAgain:
         again = Recording(folder)
         first = unlike_messages(self.recording, again)[0]
         box = again.layout.mailbox(first.mailbox)
-        was, now = (row_of(run, box, first.serial) for run in (self.recording, again))
+        recorded, repeated = (row_of(run, box, first.serial) for run in (self.recording, again))
         where = f"first {box.name} at tick {first.tick}"
-        if was is None or now is None:
-            return f"{where}, which one of the two lacks"
-        was, now = was["message"], now["message"]
+        if recorded is None or repeated is None:
+            return f"{where}, which is missing in one of the two runs"
+        recorded, repeated = recorded["message"], repeated["message"]
         names = [field.name for field in box.fields]
-        unlike = [name for name in names if not np.array_equal(was[name], now[name])]
-        return ", ".join((where, *(f"{name} was {was[name]}, is {now[name]}" for name in unlike)))
+        differing = [name for name in names if not np.array_equal(recorded[name], repeated[name])]
+        return ", ".join(
+            (where, *(f"{name} was {recorded[name]}, is {repeated[name]}" for name in differing))
+        )
 
 
 def run_of(origin: str) -> Path:
-    """Return the config of the run in RUN@TIME. Raises `Failure`."""
+    """Find the config of the run in RUN@TIME. Raises `Failure`."""
     run, at, _ = origin.rpartition("@")
     path = Path(run) / CONFIG
     if not at:
-        raise Failure(f"--from {origin}: permitted: RUN@TIME, as in runs/nasrem-1@12.5", 2)
+        raise Failure(f"--from {origin}: must be RUN@TIME, as in runs/nasrem-1@12.5", 2)
     if not path.is_file():
         raise Failure(f"--from {origin}: {run or '.'} is not a run: it has no {CONFIG}", 2)
     return path
@@ -227,56 +253,80 @@ def run_of(origin: str) -> Path:
 def beginning(
     config: RackConfig, origin: str, crate: WarmCrate | None = None, anyway: bool = False
 ) -> Iterator[Beginning]:
-    """Yield what a rack with this config, a branch perhaps, goes on from at RUN@TIME, for as long
-    as it runs. A `crate` that was started earlier saves time. Raises `Failure`.
+    """Yield the state of a recorded run from which a rack can continue, valid inside the context.
+
+    Args:
+        config: Config of the rack, which may be a branch of the run.
+        origin: The run and the time, as RUN@TIME.
+        crate: A crate that was started earlier, to save time.
+        anyway: True to repeat the run even if its code or files have changed since.
+
+    Raises:
+        Failure: The run cannot be repeated up to this time.
     """
     recording = Recording(run_of(origin).parent)
     asked = f"--from {origin}"
     tick = tick_in(recording, origin.rpartition("@")[2], f"{asked}: ")
     injected = len(recording.ended.get("faults", ())) - len(recording.rack_config.fault)
     if injected > 0:
-        why = "faults were injected while it ran, which is not repeated"
+        why = "faults were injected by hand during the run and are not repeated"
         print(f"{asked}: {injected} {why}", file=sys.stderr)
     with RunAgain(recording, asked, crate, anyway) as again:
         if again.entries is not None:
             lan = config.adapter.lan
             senders = ", ".join(map(repr, (*config.host, *(() if lan is None else lan.racks))))
-            why = f"not started: {senders}; what they sent enters again"
+            why = f"not started: {senders}; their recorded messages are replayed"
             print(f"{asked}: {why}", file=sys.stderr)
         yield again.beginning(tick)
 
 
 def tick_in(recording: Recording, text: str, asked: str = "") -> int:
-    """Return the tick of a time, s, in a recorded run. Raises `Failure`, which begins with what was
-    `asked`, for one outside, or between two stretches that were kept.
+    """Convert a time, s, to a tick of a recorded run.
+
+    Args:
+        recording: The run.
+        text: The time.
+        asked: Beginning of the text of a `Failure`.
+
+    Raises:
+        Failure: The time is outside the run, or between two recorded stretches.
     """
     tick = -1
-    # What is no time is outside, too.
+    # A text that is not a number counts as outside.
     with suppress(ValueError, OverflowError):
         tick = round(float(text) * 1e9 / recording.layout.clock_ns)
     is_kept = any(first <= tick < end for first, end in recording.kept or [(0, tick + 1)])
     begins, ends = ticks_of(recording)
     if not (begins <= tick < ends and is_kept):
         first, last = (at * recording.layout.clock_ns * 1e-9 for at in (begins, ends - 1))
-        kept = f"; {recording.kept_text}" if recording.kept else ""
-        raise Failure(f"{asked}{text}: permitted: {first:g} to {last:g} s{kept}", 2)
+        suffix = f"; {recording.kept_text}" if recording.kept else ""
+        raise Failure(f"{asked}{text}: must be {first:g} to {last:g} s{suffix}", 2)
     return tick
 
 
 def branched(
     recording: Recording, settings: Sequence[str] = (), faults: str | None = None
 ) -> RackConfig:
-    """Return the config of a branch of a run in lockstep. Raises `ConfigError`."""
+    """Load the config of a branch of a run, in lockstep.
+
+    Args:
+        recording: The run.
+        settings: Changed values, as KEY=VALUE.
+        faults: A fault script by name or path, or None.
+
+    Raises:
+        ConfigError: The changed config has mistakes.
+    """
     overrides = ["clock.mode=lockstep", "clock.speed=1.0", *settings]
     return load(str(recording.folder / CONFIG), overrides, faults)
 
 
 def unlike_in(recording: Recording, segment: Segment, tick: int) -> list[str]:
-    """Return the mailboxes whose messages until `tick` are not those of the recording."""
-    found = []
+    """List the mailboxes whose messages up to `tick` differ from those of the recording."""
+    differing = []
     for name, (serial, chain) in chains(segment, tick).items():
-        # Each message carries the chain of those before it.
-        at = np.flatnonzero(recording.signal(name, "serial") == serial + 1)
-        if len(at) and recording.signal(name, "chain")[at[0]] != chain:
-            found.append(name)
-    return found
+        # The chained checksum of a message covers all messages before it.
+        rows = np.flatnonzero(recording.signal(name, "serial") == serial + 1)
+        if len(rows) and recording.signal(name, "chain")[rows[0]] != chain:
+            differing.append(name)
+    return differing

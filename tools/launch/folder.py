@@ -1,5 +1,6 @@
-"""A run's folder, and the event log in it: events.jsonl, one JSON object a line, the outcome
-last.
+"""The folder of a run, and its event log.
+
+The log is events.jsonl: one JSON object a line, the outcome last.
 """
 
 from __future__ import annotations
@@ -21,10 +22,14 @@ RUNS = Path("runs")
 
 
 def folder_of(wanted: Path | None, rack: str) -> Path:
-    """Return the folder for a run that is about to start: `wanted`, or runs/<rack>-<time>. It is
-    created later.
+    """Choose the folder for a run that is about to start. It is created later.
 
-    Raises `Failure` when `wanted` holds files already.
+    Args:
+        wanted: The folder, or None for runs/<rack>-<time>.
+        rack: Name of the rack.
+
+    Raises:
+        Failure: `wanted` is a file, or a folder that is not empty.
     """
     if wanted is None:
         name = f"{rack}-{time.strftime('%Y%m%d-%H%M%S')}"
@@ -37,13 +42,14 @@ def folder_of(wanted: Path | None, rack: str) -> Path:
 
 
 class EventLog:
-    """Shows every event and writes it to events.jsonl, which is opened only once the rack is
-    launched.
+    """Shows every event and writes it to events.jsonl.
 
-    A write that fails, on a full disk, is reported once and does not end the run.
+    The file is opened only after the rack has been launched. A write that fails, as on a full disk,
+    is
+    reported once and does not end the run.
 
     Attributes:
-        has_failed: Whether an event could not be written.
+        has_failed: True after an event could not be written.
     """
 
     def __init__(self, display: Display) -> None:
@@ -58,14 +64,15 @@ class EventLog:
         self._write(asdict(event))
 
     def open(self, path: Path) -> None:
-        """Write to a file from now on, earlier events first."""
-        # Line-buffered: the log of a killed run is complete up to its end.
+        """Write to a file from now on, beginning with the events so far."""
+        # Buffer single lines, so that the log of a killed run is complete up to its end.
         self._file = path.open("w", buffering=1)
         self._put(self._earlier.getvalue())
 
     def end(self, outcome: Document) -> None:
-        """Write the outcome, close the file, and put its events in order: until now they are as
-        they became known.
+        """Write the outcome, close the file, and sort its events.
+
+        Until then they are in the order in which they became known.
         """
         self._write({"time_ns": time.time_ns(), "kind": "outcome", **outcome})
         self.close()
@@ -74,26 +81,27 @@ class EventLog:
 
     def close(self) -> None:
         """Close the file, with or without an outcome."""
-        # Closing retries what could not be written.
+        # Closing repeats a failed write, which would fail again.
         with suppress(OSError):
             self._file.close()
 
     def _put_in_order(self, path: Path) -> None:
-        """Sort the lines of the file; where there is no room for that, they stay as they are."""
+        """Sort the lines of the file. On a full disk it stays unsorted."""
         lines = path.read_text().splitlines(keepends=True)
         ordered = sorted(lines, key=lambda line: order_key(json.loads(line)))
         if ordered == lines:
             return
-        draft = path.with_suffix(".part")
+        sorted_file = path.with_suffix(".part")
         with suppress(OSError):
-            draft.write_text("".join(ordered))
-            draft.replace(path)
-        draft.unlink(missing_ok=True)
+            sorted_file.write_text("".join(ordered))
+            sorted_file.replace(path)
+        sorted_file.unlink(missing_ok=True)
 
     def _write(self, entry: Document) -> None:
         self._put(checked_line(entry))
 
     def _put(self, text: str) -> None:
+        """Write a text. The first failure is shown as an event."""
         try:
             if not self.has_failed:
                 self._file.write(text)

@@ -1,4 +1,4 @@
-"""One run: launched, watched, recorded, and ended in order however it ends."""
+"""Launches a rack, watches and records it, and ends it in order."""
 
 from __future__ import annotations
 
@@ -44,21 +44,27 @@ COUNTED = (
     "CORRUPT",
     "BUS_ERRORS",
 )
-"""Words of a task's control block that a result keeps."""
+"""Words of a task's control block that the result of a run keeps."""
 NO_TIME = "no time for the report: 'rack report {}' makes it"
 VIEWER = "rack.tools.viewer.window"
-"""What shows a run while it is recorded, by name: running and recording need none of it."""
+"""Module of the viewer, imported by name because running and recording do not need it."""
 NO_RECORDER = "the recorder has not begun yet: real time begins without it, lockstep waits"
 
 News = Callable[[], list[str]]
-"""Returns messages for the user since the last call, of the recorder or the viewer."""
+"""Returns messages of the recorder or the viewer for the user, since the last call."""
 
 
 @dataclass(frozen=True)
 class Beginning:
-    """What a run goes on from: a snapshot in a crate, which without one is just started earlier;
-    the commands that its operators gave; what its host boards and other racks sent, which are not
-    started then; and which run that is, for the record.
+    """State from which a run begins.
+
+    Attributes:
+        continues: Snapshot in the crate. None to begin at tick 0.
+        crate: A crate that was started earlier, to save time or because it has the snapshot.
+        requests: Commands of operators to repeat.
+        entries: Recorded messages of host boards and other racks, which are not started in that
+            case.
+        origin: The run that is continued, for the record.
     """
 
     continues: Continuation | None = None
@@ -69,17 +75,20 @@ class Beginning:
 
 
 ANEW = Beginning()
+"""A run from tick 0."""
 
 
 @dataclass(frozen=True)
 class RunResult:
-    """A finished run: its outcome, the counts of every task's control block, and the faults
-    injected into it.
+    """A finished run: its outcome, the counts of every task's control block, and its faults.
 
-    `clock_offset_ns` converts CLOCK_MONOTONIC, in which boards stamp, to the time of the events.
-    `refused`: messages that full queues refused, by queue. `recording` is "complete", "none" (not
-    wanted), or what is missing; `rows_lost` are the rows missing, by task and by mailbox. `others`
-    are the racks launched with this one; `failed` says which of them failed, and why.
+    Attributes:
+        recording: "complete", "none" if no recording was wanted, or a text about what is missing.
+        rows_lost: Number of missing rows, by task and by mailbox.
+        clock_offset_ns: Converts CLOCK_MONOTONIC, the clock of boards, to the time of the events.
+        refused: Messages that full queues refused, by queue.
+        others: Racks that were launched with this one.
+        failed: Which of them failed, and why. Empty if none did.
     """
 
     rack: str
@@ -97,13 +106,14 @@ class RunResult:
 
     @property
     def worked(self) -> bool:
-        """Whether the run succeeded as far as its end shows it: only a report judges its system
-        response.
+        """True if the run succeeded as far as its end shows.
+
+        Only a report judges the response of the system.
         """
         return not self.failure()
 
     def failure(self) -> str:
-        """Return in one line why the run did not succeed."""
+        """Return in one line why the run failed, or an empty text."""
         return "; ".join(list_failures(self.outcome, self.recording, self.failed))
 
 
@@ -118,23 +128,32 @@ def run_rack(
     step: bool = False,
     begins: Beginning = ANEW,
 ) -> RunResult:
-    """Run a rack for `seconds` of simulated time, or until its task ends; record it into `folder`
-    unless that is None.
+    """Run a rack, and record it.
 
-    With `view`, open a viewer on what the recorder serves; it may be closed at any time. With
-    `step`, in lockstep, hold before tick 0 until the rack is stepped. `share` is as
-    in `Rack`; `begins`: the crate, and the run that it continues or repeats. Launch the racks that
-    the config names: one that fails ends the run, and a run that does not succeed ends them.
+    The racks that the config names are launched as well. If one of them fails, the run ends; if the
+    run
+    does not succeed, they end. A recorder that dies does not end the run.
 
-    Raises what `Rack` raises; a rack that could not be launched leaves no folder. A recorder that
-    dies does not end the run, but files that cannot be written do: raises `Failure`.
+    Args:
+        config: Config of the rack.
+        seconds: Simulated time of the run, s. None to run until its task ends.
+        folder: Folder of the run. None to record nothing.
+        display: Shows the run.
+        view: True to open a viewer on the recorder. The user may close it at any time.
+        share: As in `Rack`.
+        step: True to hold the rack before tick 0 until it is stepped. Only in lockstep.
+        begins: Crate, snapshot and entries of a run that is continued or repeated.
+
+    Raises:
+        Failure: A file cannot be written. Errors of `Rack` are raised as well; a rack that could
+            not be launched leaves no folder.
     """
     log = EventLog(display)
     with closing(log), ExitStack() as stack:
-        # Until the run has begun there is nothing to keep.
+        # Until the run has begun there is nothing to save, so a signal may end it at once.
         with INTERRUPT.at_once():
             lan = config.adapter.lan
-            # In a replay what they sent enters again.
+            # In a repeated run their recorded messages are replayed instead.
             launches = lan.launch if lan is not None and begins.entries is None else ()
             others = stack.enter_context(OtherRacks(launches, config, seconds, folder is not None))
             recorder = None if folder is None else RecorderProcess(folder)
@@ -174,7 +193,7 @@ def run_rack(
             wall_s = time.monotonic() - started
         log_news()
         if recorder is not None and not INTERRUPT.number:
-            # Later it would find no rack to attach to.
+            # The recorder could not attach to a closed rack.
             recorder.await_begun()
         rack.close()
         recording, rows_lost = "none", dict[str, int]()
@@ -196,8 +215,16 @@ def run_rack(
 def begin_folder(
     folder: Path, config: RackConfig, log: EventLog, origin: Origin | None = None
 ) -> None:
-    """Write what is known when a run begins into its folder: config, code, the events so far.
-    Raises `Failure`.
+    """Create the folder of a run, with config, code and the events so far.
+
+    Args:
+        folder: The folder.
+        config: Config of the rack.
+        log: Event log, which from now on writes to the folder.
+        origin: The run that is continued, or None.
+
+    Raises:
+        Failure: A file cannot be written.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -218,7 +245,16 @@ def result_of(
     recording: str,
     rows_lost: dict[str, int],
 ) -> RunResult:
-    """Return the result of a run that is over, by the words of its segment."""
+    """Build the result of a finished run from the words of its segment.
+
+    Args:
+        segment: Segment of the rack, still attached.
+        config: Config of the rack.
+        outcome: Outcome of the run.
+        wall_s: Wall-clock time of the run, s.
+        recording: As in `RunResult`.
+        rows_lost: As in `RunResult`.
+    """
     return RunResult(
         rack=config.name,
         outcome=outcome,
@@ -242,9 +278,7 @@ def result_of(
 
 
 def _open_viewer(port: int) -> News:
-    """Open the viewer on what the recorder serves; return its news. Without a viewer the rack runs
-    all the same.
-    """
+    """Open the viewer on the recorder and return its news, which report a missing viewer."""
     window = import_module(VIEWER)
     try:
         opened: News = window.ViewerWindow(window.url(port)).news
@@ -262,13 +296,13 @@ def _watch(
     log_news: Callable[[], None],
     others: OtherRacks,
 ) -> Outcome:
-    """Run the rack to its end; show it, and log what only the host side can see."""
+    """Run the rack to its end, show it, and log events that only the host side can detect."""
     rack.start(seconds)
     monitor = RackMonitor(rack.segment)
     standstill = Standstill(rack.segment)
     is_running = True
     while is_running:
-        # The last look is at the rack's end: a run in lockstep may be over between two.
+        # Take one more snapshot after the end: a lockstep run may end between two snapshots.
         is_running = rack.watch(display.period_s)
         display.show(monitor.look())
         log_news()
@@ -286,18 +320,25 @@ def _watch(
 def compare_recording(
     folder: Path, segment: Segment, why: str, ticks: int
 ) -> tuple[str, dict[str, int]]:
-    """Compare the files with what the rings say was written; `why` is how the recorder ended.
+    """Compare the files of a run with the number of rows that were written to the rings.
 
-    Return "complete" or what is missing, and the rows missing by task and by mailbox.
+    Args:
+        folder: Folder of the run.
+        segment: Segment of the rack.
+        why: How the recorder ended.
+        ticks: Ticks of the run.
+
+    Returns:
+        "complete" or a text about what is missing, and the missing rows by task and by mailbox.
     """
-    # Here, not above: its libraries would delay the launch.
+    # Import late, because these libraries would delay the launch.
     from rack.tools.recording.occasions import Retention
     from rack.tools.recording.recording import Recording
     from rack.tools.recording.run_files import find_missing, tally
 
     try:
         retention = Retention.of(segment)
-        # A run that was interrupted has no time to make tables of what a flight recorder kept.
+        # An interrupted run has no time to convert the rows of a flight recorder to tables.
         left = None if retention is None else tally(folder)
         if retention is None or left is None:
             missing = Recording(folder).missing(segment)
@@ -305,16 +346,16 @@ def compare_recording(
             missing = find_missing(segment, left.taken, left.lost)
             if not missing and (absent := retention.absent(segment, left.kept, ticks)):
                 first, last = absent[0]
-                return f"ticks {first:,} to {last:,} had to be kept, and are not there", {}
+                return f"ticks {first:,} to {last:,} should have been kept but are missing", {}
         if not missing:
             return "complete", {}
         gaps = Recording(folder).gaps({name: rows for name, (rows, _) in missing.items()}, ticks)
     except Failure as error:
         return f"{why}; {error}", {}
-    most, name = max((found, name) for name, found in missing.items())
+    most, name = max((loss, name) for name, loss in missing.items())
     text = f"{most.rows:,} of {most.written:,} rows of {name} are missing"
     if len(missing) > 1:
         text += f" (and rows of {len(missing) - 1} more tasks and mailboxes)"
     return "; ".join((text, *map(str, gaps), why)), {
-        name: found.rows for name, found in missing.items()
+        name: loss.rows for name, loss in missing.items()
     }

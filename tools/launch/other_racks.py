@@ -1,6 +1,4 @@
-"""The racks that `adapter.lan.launch` names: a run launches them with its own, each by `rack run`
-in a process of its own.
-"""
+"""Launches the racks named in `adapter.lan.launch`, each by `rack run` in a separate process."""
 
 from __future__ import annotations
 
@@ -20,14 +18,14 @@ from rack.boards.config.schema import RackConfig
 from rack.tools.console.answer import Document
 
 END_S = 60.0
-"""Longest wait for their end after this rack's own: they report on their runs, too."""
+"""Longest wait for the end of the other racks after this rack's end, including their reports."""
 STOP_S = 3.0
-"""Longest wait for one that is stopped."""
+"""Longest wait for the end of a rack that is stopped."""
 
 
 @dataclass(frozen=True)
 class OtherEnd:
-    """How another rack has ended; `folder` is that of its run, None: it was not recorded."""
+    """The end of another rack. `folder` is None if its run was not recorded."""
 
     rack: str
     cause: str
@@ -37,7 +35,7 @@ class OtherEnd:
 
 
 class Launched(NamedTuple):
-    """Another rack. Its report is in a file in memory: nobody would empty a pipe."""
+    """Another rack. Its report goes to a file in memory, because nobody would empty a pipe."""
 
     config: str
     process: subprocess.Popen[bytes]
@@ -45,12 +43,19 @@ class Launched(NamedTuple):
 
 
 class OtherRacks:
-    """Other racks while this one runs. Whoever leaves the context leaves none of them."""
+    """The other racks of a run. Leaving the context ends them all."""
 
     def __init__(
         self, configs: Sequence[str], config: RackConfig, seconds: float | None, is_recorded: bool
     ) -> None:
-        """Launch racks by their `configs`, with the clock of `config`, and for as long."""
+        """Launch racks with the clock and the duration of this rack.
+
+        Args:
+            configs: Names or paths of their configs.
+            config: Config of this rack.
+            seconds: Simulated time of the run, or None.
+            is_recorded: False to record none of them.
+        """
         options = ["--json", "--share", f"--speed={config.clock.speed}"]
         options += ["--lockstep"] if config.clock.mode == "lockstep" else []
         options += [] if seconds is None else [f"--seconds={seconds}"]
@@ -60,7 +65,8 @@ class OtherRacks:
         self._racks: list[Launched] = []
         for other in configs:
             report = os.memfd_create("report")
-            # A group of its own: Ctrl-C would reach it twice, from the terminal and from here.
+            # Use a new process group. Otherwise Ctrl-C would reach the rack twice, from the
+            # terminal and from this process.
             process = subprocess.Popen(
                 [sys.executable, "-P", "-m", "rack.tools.cli", "run", other, *options],
                 stdin=subprocess.DEVNULL,
@@ -74,21 +80,21 @@ class OtherRacks:
         return len(self._racks)
 
     def failure(self) -> str:
-        """Return which of them have failed so far, and how; empty: none."""
-        # Those that have been stopped end by a signal: that is no failure.
+        """Return which of the racks have failed so far, and how. Empty if none has."""
+        # Racks stopped by this process end by a signal, which does not count as a failure.
         if not self._is_stopped:
             failed = [rack for rack in self._racks if rack.process.poll()]
             self._failed = "; ".join(f"{rack.config}: {_failure_of(rack)}" for rack in failed)
         return self._failed
 
     def stop(self) -> None:
-        """Let all of them end."""
+        """Ask all of the racks to end."""
         self._is_stopped = True
         for rack in self._racks:
             rack.process.terminate()
 
     def finish(self) -> str:
-        """Wait for their end; return what `failure` does."""
+        """Wait for the end of the racks, and return their failures as `describe_failures` does."""
         deadline = time.monotonic() + (STOP_S if self._is_stopped else END_S)
         late = []
         for rack in self._racks:
@@ -99,14 +105,14 @@ class OtherRacks:
         return "; ".join(late) or self.failure()
 
     def ends(self) -> tuple[OtherEnd, ...]:
-        """Return how those have ended that ran."""
-        found = []
+        """Return how each rack that ran has ended."""
+        ended = []
         for rack in self._racks:
             report = _report_of(rack)
             if outcome := report.get("outcome"):
                 end = outcome["cause"], outcome["ticks"], outcome["digest"]
-                found.append(OtherEnd(report["rack"], *end, report["folder"]))
-        return tuple(found)
+                ended.append(OtherEnd(report["rack"], *end, report["folder"]))
+        return tuple(ended)
 
     def __enter__(self) -> Self:
         return self
@@ -120,15 +126,15 @@ class OtherRacks:
 
 
 def _report_of(rack: Launched) -> Document:
-    """Return the report of a rack; empty if it has not printed all of one."""
+    """Return the report of a rack, or an empty document if it is incomplete."""
     with suppress(ValueError):
-        found: Document = json.loads(os.pread(rack.report, os.fstat(rack.report).st_size, 0))
-        return found
+        report: Document = json.loads(os.pread(rack.report, os.fstat(rack.report).st_size, 0))
+        return report
     return {}
 
 
 def _failure_of(rack: Launched) -> str:
-    """Return why a rack failed."""
+    """Describe why a rack failed."""
     report = _report_of(rack)
     why = report.get("failures") or report.get("error")
     return "; ".join(why or [how_ended(rack.process.returncode)])

@@ -1,6 +1,6 @@
 """The verdict on a run: why it failed, and what was not judged.
 
-Exit status, first line, report.json, report.md and `--json` all take it from here.
+Exit status, first line, report.json, report.md and `--json` all use this verdict.
 """
 
 from __future__ import annotations
@@ -19,11 +19,13 @@ def judge_run(ended: Mapping[str, Any], response: Document | None) -> Document:
     """Judge a run.
 
     Args:
-        ended: The end of the run, a `RunResult` as plain data; empty if it is not recorded.
-        response: The system response; None if the rack has none, or nothing is recorded.
+        ended: End of the run, a `RunResult` as plain data. Empty if it was not recorded.
+        response: Response of the system. None if the rack has none, or nothing was recorded.
 
     Returns:
-        `worked`; `failures`: why it did not, a line each; `unjudged`: what was not judged, and why.
+        `worked`, `failures` with one line for each reason, and `unjudged` with whatever was not
+            judged
+        and why.
     """
     unjudged: list[str] = []
     failures = ["the end of the run is not recorded"]
@@ -39,25 +41,38 @@ def judge_run(ended: Mapping[str, Any], response: Document | None) -> Document:
 
 
 def list_failures(outcome: Outcome, recording: str, others: str) -> list[str]:
-    """Return why a run failed, as far as its end shows it; `others`: why other racks failed."""
-    lost = "" if recording in ("complete", "none") else f"not all is recorded: {recording}"
+    """List the reasons why a run failed, as far as its end shows them.
+
+    Args:
+        outcome: Outcome of the run.
+        recording: As in `RunResult`.
+        others: Why other racks failed.
+    """
+    lost = "" if recording in ("complete", "none") else f"the recording is incomplete: {recording}"
     return [why for why in (outcome.failure, lost, others) if why]
 
 
 def _long_responses(response: Document) -> Iterator[str]:
+    """Yield a failure for each chain whose response exceeded its bound without a lost cycle."""
     for chains in (response, *response["others"]):
-        for way in ("command", "status"):
-            found = chains[way]
-            if count := sum(not each["delayed_by"] for each in found["beyond"]):
+        for direction in ("command", "status"):
+            chain = chains[direction]
+            if count := sum(not excess["delayed_by"] for excess in chain["beyond"]):
                 yield (
-                    f"the response of a {way} along {' > '.join(found['levels'])} took up to"
-                    f" {found['measured_ms']['max']:g} ms; bound: {found['bound_ms']:g} ms, {count}"
+                    f"the response of a {direction} along {' > '.join(chain['levels'])} took up to"
+                    f" {chain['measured_ms']['max']:g} ms; bound: {chain['bound_ms']:g} ms, {count}"
                     " times exceeded without a lost cycle"
                 )
 
 
 def headline(rack: str, outcome: Document | None, failures: list[str]) -> str:
-    """Return the verdict in one line."""
+    """Return the verdict in one line.
+
+    Args:
+        rack: Name of the rack.
+        outcome: Outcome of the run. None if it was not recorded.
+        failures: Reasons why the run failed.
+    """
     if failures or outcome is None:
         return f"{rack} failed: {'; '.join(failures)}"
     return ": ".join(filter(None, (rack, outcome["cause"], outcome["reason"])))

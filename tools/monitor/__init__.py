@@ -1,1 +1,1 @@
-"""Observation and control of a running rack: snapshot, holds, signals, operator commands."""
+"""Observes and controls a running rack: snapshots, holds, signals, commands of operators."""

@@ -1,6 +1,4 @@
-"""The operator's desk of a running rack, from the host side: gives a command to a level and waits
-for its reply.
-"""
+"""Gives commands to the levels of a running rack and waits for their replies."""
 
 from __future__ import annotations
 
@@ -34,82 +32,96 @@ from rack.tools.monitor.newest_messages import Newest
 from rack.tools.monitor.replies import LastCycle, Replies, Reply, answering
 
 SILENT_S = 5.0
-"""Time without a tick after which a wait is given up."""
+"""A wait is given up after this time without a tick."""
 NOTE_S = 1.5
-"""Time after which a wait is explained on stderr."""
+"""A wait is explained on stderr after this time."""
 LOOK_S = 0.001
-"""Time between two looks at the rack."""
+"""Time between two checks of the rack."""
 GOAL_KEYS = ("joints", "position", "quaternion", "direction")
 
 
 class LiveDesk:
-    """The desk of one rack."""
+    """Commands the levels of one rack."""
 
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
         self._config = read_stored(self._segment.config)
         levels = PublishedRack.of_rack(self._segment).levels
-        self._levels = {name: one for name, one in levels.items() if one.commands}
+        self._levels = {name: published for name, published in levels.items() if published.commands}
 
     def levels(self) -> list[dict[str, str]]:
-        """Return the commands that each level takes, and the one in force, as plain data."""
+        """List the commands that each level takes, and the one in force, as plain data."""
         return [
             {"level": name, "in_force": self._in_force(name), "takes": takes(level)}
             for name, level in self._levels.items()
         ]
 
     def text(self) -> Iterator[str]:
-        """Yield the same as a table."""
+        """Yield the lines of a table of `list_levels`."""
         return fitted(["level", "in force", "takes"], [list(row.values()) for row in self.levels()])
 
     def highest(self, *in_force: str) -> list[str]:
-        """Return the levels that take a hold and have one of these commands in force ("": none),
-        without those below another one of them.
+        """List the highest levels that can hold and have one of some commands in force.
+
+        A level below another one of the result is left out.
+
+        Args:
+            in_force: Names of commands. "" stands for no command.
         """
-        found = [
+        levels = [
             name
             for name in self._levels
             if self._takes_hold(name) and self._in_force(name) in in_force
         ]
-        lower = set[str]().union(*map(self._config.all_below, found))
-        return [name for name in found if name not in lower]
+        lower_levels = set[str]().union(*map(self._config.all_below, levels))
+        return [name for name in levels if name not in lower_levels]
 
     def give(self, given: Mapping[str, Any], wait: bool, timeout_s: float | None = None) -> Reply:
-        """Give a command and wait until its level takes it up; with `wait`, until it is done.
+        """Give a command, and wait until its level has taken it up or, with `wait`, has done it.
 
-        `timeout_s` of wall-clock time bounds that wait; None: until the end of the run.
+        Args:
+            given: Keys of a `[[command]]` table.
+            wait: True to wait until the command is done.
+            timeout_s: Wall-clock time for that. None to wait until the end of the run.
 
-        Raises `ConfigError` with every mistake, and `Failure` when it is not given or not answered
-        in time.
+        Raises:
+            ConfigError: The command has mistakes: all of them.
+            Failure: The command was not given, or not answered in time.
         """
         segment = self._segment
-        command, wanted = self._request(given)
-        if held := waits(segment):
-            # Without a client: the user steps the rack afterwards.
-            entry = OperatorTable(segment).add(wanted)
+        command, clock_request = self._request(given)
+        if wait_text := waits(segment):
+            # Leave the request in the table for the next step, after this process has ended.
+            entry = OperatorTable(segment).add(clock_request)
             text = describe(message_of(entry, segment.layout))
-            return Reply(0, command.level, text, -1, "waiting", waits=held)
-        # However the wait ends, leaving the claim withdraws a request that has not been given.
-        with OperatorTable(segment).claim(wanted) as entry:
+            return Reply(0, command.level, text, -1, "waiting", waits=wait_text)
+        # Leaving the claim withdraws a request that has not been given, however the wait ends.
+        with OperatorTable(segment).claim(clock_request) as entry:
             reply = self._await_giving(entry, command.level)
         return self._await_reply(reply, wait, timeout_s)
 
     def attend(self, given: Mapping[str, Any], tell: Callable[[Reply], None]) -> None:
-        """Give a command under a lease, `tell` its reply, and stay until a newer one is in force or
-        the run is over: if this process ends or falls silent before, its level holds.
+        """Give a command under a lease, and stay until a newer one is in force or the run is over.
 
-        Raises as `give` does, and for a command that leaves none in force.
+        If this process ends or falls silent before that, the level holds.
+
+        Args:
+            given: As in `give_command`.
+            tell: Called with the reply of the level.
+
+        Raises:
+            Failure: As in `give_command`, and for a command that does not stay in force.
         """
-        command, wanted = self._request(given)
+        command, clock_request = self._request(given)
         segment = self._segment
         if command.said not in EFFECTS or not self._takes_hold(command.level):
-            kept = ", ".join(what.name.lower() for what in EFFECTS)
-            why = f"permitted: {kept}, to levels that take a hold"
+            lasting = ", ".join(operation.name.lower() for operation in EFFECTS)
+            why = f"must be one of {lasting}, to a level that can hold"
             raise Failure(f"--lease: '{command.level}', {command.what}: {why}", 2)
-        if held := waits(segment):
-            raise Failure(f"--lease: the rack is held: {held}")
+        if wait_text := waits(segment):
+            raise Failure(f"--lease: the rack is held: {wait_text}")
         table = OperatorTable(segment)
-        with table.claim(wanted, Client.LEASES) as entry:
+        with table.claim(clock_request, Client.LEASES) as entry:
             ticket = entry.ticket
             reply = self._await_reply(self._await_giving(entry, command.level), False, None)
             tell(reply)
@@ -119,10 +131,10 @@ class LiveDesk:
     def _takes_hold(self, level: str) -> bool:
         return Operation.HOLD in (self._levels[level].commands)
 
-    def _request(self, given: Mapping[str, Any]) -> tuple[CommandConfig, Request]:
-        """Return a command and what asks the clock for it. Raises as `give` does."""
+    def _request(self, fields: Mapping[str, Any]) -> tuple[CommandConfig, Request]:
+        """Build a command and its request to the clock. Raises like `give_command`."""
         tick = self._segment.words[System.TICK]
-        command = asked({key: value for key, value in given.items() if value is not None})
+        command = asked({key: value for key, value in fields.items() if value is not None})
         wanted = request(command, self._config, self._levels, self._segment.layout)
         if 0 <= wanted.tick <= tick:
             key, value = ("tick", command.tick) if command.at is None else ("at", command.at)
@@ -132,22 +144,34 @@ class LiveDesk:
         return command, wanted
 
     def set_param(self, setting: str, tick: int | None = None, at: float | None = None) -> Reply:
-        """Set a live parameter, as in `board.servo.params.bandwidth=80`; raises as `give` does."""
+        """Set a live parameter.
+
+        Args:
+            setting: KEY=VALUE, as in `board.servo.params.bandwidth=80`.
+            tick: Tick of the command. None for the next one.
+            at: The same in simulated seconds.
+
+        Raises:
+            Failure: The parameter is not live, or as in `give_command`.
+        """
         place, _, _ = setting.partition("=")[0].rpartition(".")
         live = {
-            name: one.live for name, one in self._levels.items() if Operation.SET in one.commands
+            name: published.live
+            for name, published in self._levels.items()
+            if Operation.SET in published.commands
         }
         level = next((level for level in live if place == f"board.{level}.params"), None)
         if level is None:
             known = [f"board.{board}.params.{key}" for board, keys in live.items() for key in keys]
             raise Failure(
-                f"{setting}: no level reads it while it runs; live: {', '.join(known) or 'none'}", 2
+                f"{setting}: not a live parameter; valid keys: {', '.join(known) or 'none'}", 2
             )
         name = setting.removeprefix(f"{place}.")
-        given = {"level": level, "what": "set", "name": name, "tick": tick, "at": at}
-        return self.give(given, wait=False)
+        fields = {"level": level, "what": "set", "name": name, "tick": tick, "at": at}
+        return self.give(fields, wait=False)
 
     def _await_giving(self, entry: RequestEntry, level: str) -> Reply:
+        """Wait until the clock has given a command to its level. Raises `Failure`."""
         ticket = entry.ticket
         text = describe(message_of(entry, self._segment.layout))
         about = f"'{level}', {text}"
@@ -157,10 +181,11 @@ class LiveDesk:
             if entry.stage == RequestStage.GIVEN:
                 return Reply(entry.serial, level, text, entry.given_tick)
             if is_over:
-                raise Failure(f"{about}: the run ended before it was given")
-        raise Failure(f"{about}: given, but its reply is lost: too many commands followed")
+                raise Failure(f"{about}: the run ended before the command was given")
+        raise Failure(f"{about}: given, but the reply is lost because too many commands followed")
 
     def _await_reply(self, reply: Reply, wait: bool, timeout_s: float | None) -> Reply:
+        """Wait until the level has taken the command up or, with `wait`, has done it."""
         deadline = math.inf if timeout_s is None else time.monotonic() + timeout_s
         status = answering(self._segment, reply.level)
         if status is None:
@@ -184,15 +209,18 @@ class LiveDesk:
         return reply
 
     def _looks(self, about: str, awaited: str) -> Iterator[bool]:
-        """Yield again and again whether the run is over, for as long as the clock ticks or the rack
-        is held; explain a long wait on stderr, once.
+        """Yield at each check of the rack whether the run is over.
+
+        A long wait is explained on stderr, once. Raises `Failure` if the clock stops ticking and
+        the rack
+        is not held.
         """
         words = self._segment.words
         tick = words[System.TICK]
         changed = time.monotonic()
         note_at = changed + NOTE_S
         while True:
-            # Asked before the look: a reply written just before the run ended still counts.
+            # Read this before the statuses: a reply written just before the run ended still counts.
             yield self._segment.run_is_over
             time.sleep(LOOK_S)
             now = time.monotonic()
@@ -205,24 +233,29 @@ class LiveDesk:
                     f"{about}: {awaited}; the rack is at tick {tick}", file=sys.stderr, flush=True
                 )
             if now - changed >= SILENT_S:
-                raise Failure(f"{about}: not answered, the clock has not ticked for {SILENT_S:g} s")
+                raise Failure(f"{about}: no answer: the clock has not ticked for {SILENT_S:g} s")
 
     def _in_force(self, level: str) -> str:
-        """Return the operator's command in force at a level; empty: none."""
+        """Return the operator's command in force at a level, or an empty text."""
         status = Newest(self._segment).message(f"{level}.status")
         standing = getattr(status, "standing", 0)
         return Operation(standing).name.lower() if standing else ""
 
 
 def goal_of(what: str, words: Sequence[str]) -> Document:
-    """Return what follows the verb, as in a `[[command]]` table.
+    """Parse the words after the verb of a command, as keys of a `[[command]]` table.
 
-    Typed as `home`, key=numbers, NAME on|off, or the name of a table or command. Raises `Failure`.
+    Args:
+        what: The verb.
+        words: `home`, key=numbers, NAME on|off, or the name of a table or command.
+
+    Raises:
+        Failure: A word is not valid.
     """
     if what == "modify":
         if len(words) != 2 or words[1] not in ("on", "off"):
             raise Failure(
-                f"'modify {' '.join(words)}': permitted: modify NAME on, modify NAME off", 2
+                f"'modify {' '.join(words)}': must be 'modify NAME on' or 'modify NAME off'", 2
             )
         return {"name": words[0], "on": words[1] == "on"}
     if what in ("table", "do", "set"):
@@ -235,19 +268,17 @@ def goal_of(what: str, words: Sequence[str]) -> Document:
         if word == "home":
             goal["home"] = True
         elif not is_given or key not in GOAL_KEYS:
-            permitted = ", ".join(f"{k}=..." for k in GOAL_KEYS)
-            raise Failure(f"'{word}': not a goal; permitted: home, {permitted}", 2)
+            keys = ", ".join(f"{k}=..." for k in GOAL_KEYS)
+            raise Failure(f"'{word}': not a goal; valid goals: home, {keys}", 2)
         else:
             goal[key] = [_number(value, word) for value in values.split(",")]
     return goal
 
 
 def _number(text: str, word: str) -> float:
+    """Parse a number of a goal. Raises `Failure` with the whole word."""
     try:
         return float(text)
     except ValueError:
-        why = (
-            f"'{text}' is not a number; permitted: numbers separated by commas, as in"
-            " joints=0,0.5,1"
-        )
+        why = f"'{text}' is not a number; numbers are separated by commas, as in joints=0,0.5,1"
         raise Failure(f"'{word}': {why}", 2) from None

@@ -1,8 +1,7 @@
-"""A rack on the terminal: a live table while it runs; a line a second where there is no terminal;
-nothing with --json.
+"""Shows a rack on the terminal while it runs.
 
-The table has a line a task; below it are the active faults, what holds the rack, and the progress
-of its task.
+On a terminal it is a live table with a line for each task. Below the table are active faults, holds
+and the progress of the task. Elsewhere one line a second is printed, and nothing with --json.
 """
 
 from __future__ import annotations
@@ -43,7 +42,7 @@ COLUMNS: dict[str, Callable[[TaskRow], str]] = {
     "late ms": lambda row: decimal(row.lateness_ms, 2),
     "state": lambda row: row.state + " (operator)" * (row.mode == "operator"),
 }
-"""Columns by heading."""
+"""Text of each column by its heading."""
 DROPPED = (
     "tick",
     "sched",
@@ -71,22 +70,26 @@ COUNTED = {**dict.fromkeys(LOSSES, "red"), **dict.fromkeys(TROUBLES, "yellow")}
 """Colours of counts above 0."""
 HELD = "bold yellow"
 NO_DEMAND = "none"
-"""The demand on an arm that is free to move."""
+"""Demand on an arm that is free to move."""
 EVENTS = {"fault": "magenta", "detection": "yellow", "reaction": "red", "recovery": "green"}
 OTHER_EVENTS = "yellow"
 QUIET = ("launch", "start", "end", "miss")
-"""Events that the display shows already: the table counts the misses."""
+"""Kinds of events that the table shows already: for example, it counts misses."""
 BRIEF_TICKS = 10
-"""Brakes that missed cycles engaged for fewer ticks than this are counted, not shown."""
+"""Brakes engaged by missed cycles for fewer ticks than this are only counted."""
 
 
 class Display:
-    """Shows a run; this one shows nothing, for --json. `period_s` is the time between looks."""
+    """Shows a run. This base class shows nothing, for --json.
+
+    Attributes:
+        period_s: Time between two snapshots.
+    """
 
     period_s = 0.5
 
     def show(self, snapshot: Snapshot) -> None:
-        """Show the rack as it is now."""
+        """Show the rack as in a snapshot."""
 
     def show_event(self, event: Event) -> None:
         """Show an event, unless the table shows it already."""
@@ -111,12 +114,12 @@ class LiveDisplay(Display):
 
     def print_event(self, text: Text) -> None:
         """Print the event above the table."""
-        # The terminal wraps it, not rich: a command in it can still be copied.
+        # Let the terminal wrap the line instead of rich, so that a command in it can be copied.
         self._live.console.print(text, soft_wrap=True)
 
 
 class PlainDisplay(Display):
-    """A line a second."""
+    """Prints one line a second."""
 
     period_s = 1.0
 
@@ -137,7 +140,7 @@ class PlainDisplay(Display):
 
 @contextmanager
 def display_for(silent: bool) -> Iterator[Display]:
-    """Give the display that suits stdout."""
+    """Provide the display that suits stdout, or a silent one."""
     terminal = console()
     if silent:
         yield Display()
@@ -152,8 +155,10 @@ def display_for(silent: bool) -> Iterator[Display]:
 
 @dataclass(frozen=True)
 class RackView:
-    """A snapshot, for rich to draw: head line, tasks, rows of tables, complaints, queues, faults,
-    holds, progress.
+    """A snapshot that rich can draw.
+
+    It has a head line, tables of tasks, hosts and network, reasons, queues, faults, holds and
+    progress.
     """
 
     snapshot: Snapshot
@@ -170,26 +175,31 @@ class RackView:
         yield from (Text(f"{row.task}: {row.row}") for row in snapshot.tasks if row.row)
         sides: tuple[Sequence[Any], ...] = (snapshot.hosts, snapshot.entries)
         for rows in (*sides, snapshot.peers, snapshot.imports, snapshot.exports):
-            if found := [asdict(row) for row in rows]:
-                cells = [[_cell(*pair) for pair in row.items()] for row in found]
+            if records := [asdict(row) for row in rows]:
+                cells = [[_cell(*pair) for pair in row.items()] for row in records]
                 yield Text()
-                yield grid([key.replace("_", " ") for key in found[0]], cells, width, style=_style)
+                yield grid(
+                    [key.replace("_", " ") for key in records[0]], cells, width, style=_style
+                )
         yield from (Text(line, style="red") for line in _reasons(snapshot))
         yield from (Text(queue.line) for queue in snapshot.queues)
         yield from (Text(inbox.line) for inbox in snapshot.inboxes)
-        yield from (Text(_exchange(*found)) for found in snapshot.exchanges.items())
+        yield from (Text(_exchange(*ages)) for ages in snapshot.exchanges.items())
         yield from (Text(f"fault: {fault}", style="magenta") for fault in snapshot.faults)
         for hold in snapshot.holds:
-            # In two lines where it is long: a command must not be wrapped.
+            # Split a long line in two, so that the command in it is not wrapped.
             is_long = len(hold.line) > width
-            shown = hold.line.replace("; to release", "\n  to release") if is_long else hold.line
-            yield Text(shown, style=HELD)
+            hold_text = (
+                hold.line.replace("; to release", "\n  to release") if is_long else hold.line
+            )
+            yield Text(hold_text, style=HELD)
         if (at := snapshot.progress) is not None:
             actions = f"{at.actions_done}/{at.actions}"
             yield Text(f"task: action {actions}, move {at.moves_done}/{at.moves} {at.state}")
 
 
 def _cell(column: str, value: Any) -> str:
+    """Format a cell, with decimals by the unit at the end of the column's name."""
     if not isinstance(value, float | None):
         return str(value)
     digits = {"s": 3, "ticks": 0}
@@ -197,9 +207,7 @@ def _cell(column: str, value: Any) -> str:
 
 
 def line_of(snapshot: Snapshot) -> str:
-    """Return the rack as one short line, for where there is no terminal: what holds it and its
-    faults are counted.
-    """
+    """Format a snapshot as one short line that only counts holds and faults."""
     counts = {
         "missed": sum(row.missed for row in snapshot.tasks),
         "skipped": sum(row.skipped for row in snapshot.tasks),
@@ -212,13 +220,14 @@ def line_of(snapshot: Snapshot) -> str:
     parts += [f"{name} {n}" for name, n in counts.items() if n or name in LOSSES]
     at = snapshot.progress
     parts += [f"task {at.state} {at.moves_done}/{at.moves}"] if at is not None else []
-    # What follows a colon is in the table.
+    # Keep only the text before the colon. The rest is for the table.
     return "  ".join(
         [*parts, *(line.partition(":")[0] for line in snapshot.lines), *_demanded(snapshot)]
     )
 
 
 def _head(snapshot: Snapshot) -> Text:
+    """Return the head line: state of the run, time, and warnings."""
     line = Text(
         f"rack {snapshot.rack}: {snapshot.run}, {snapshot.time_s:.2f} s, tick {snapshot.tick}"
     )
@@ -232,30 +241,27 @@ def _head(snapshot: Snapshot) -> Text:
 
 
 def _demanded(snapshot: Snapshot) -> list[str]:
-    """Return the demand on the arm, if there is one."""
+    """Return the demand on the arm, or an empty list."""
     return [f"arm: {snapshot.demand}"] if snapshot.demand != NO_DEMAND else []
 
 
 def _reasons(snapshot: Snapshot) -> list[str]:
     """Return the reasons that tasks give, except those that a hold already shows."""
-    held = {hold.level for hold in snapshot.holds}
-    shown = [hold.why for hold in snapshot.holds]
+    held_levels = {hold.level for hold in snapshot.holds}
+    shown_reasons = [hold.why for hold in snapshot.holds]
     return [
         f"{row.task}: {row.reason}"
         for row in snapshot.tasks
         if row.reason
-        and not (row.state == "holding" and row.task in held)
-        and is_news(row.reason, shown)
+        and not (row.state == "holding" and row.task in held_levels)
+        and is_news(row.reason, shown_reasons)
     ]
 
 
 def _exchange(board: str, ports: Mapping[str, PortAge]) -> str:
-    """Return the ages of a board's messages, as one line."""
-    shown = [
-        f"{port} {found.age} ticks old, taken at tick {found.taken}"
-        for port, found in ports.items()
-    ]
-    return f"exchange of {board}: {'; '.join(shown) or 'no message yet'}"
+    """Format the ages of a board's exchanged messages as one line."""
+    ages = [f"{port} {age.age} ticks old, taken at tick {age.taken}" for port, age in ports.items()]
+    return f"exchange of {board}: {'; '.join(ages) or 'no message yet'}"
 
 
 def _style(column: str, text: str) -> str:
@@ -265,13 +271,13 @@ def _style(column: str, text: str) -> str:
 
 
 def is_shown(event: Event) -> bool:
-    """Return whether an event is more than the table shows."""
+    """Return whether an event tells more than the table."""
     is_brief = event.subject == NO_TORQUE and event.value < BRIEF_TICKS
     return event.kind not in QUIET and not is_brief
 
 
 def event_text(event: Event) -> Text:
-    """Return an event as one line, in the colour of its kind."""
+    """Format an event as one line, in the colour of its kind."""
     tick = f"tick {event.tick} " if event.code else ""
     board = f"{event.board}: " if event.board else ""
     style = EVENTS.get(event.kind, OTHER_EVENTS)

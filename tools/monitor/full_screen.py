@@ -1,7 +1,7 @@
-"""The full screen of `rack top`: boards, mailboxes, events and lateness of a rack, and keys that
-command it. It needs textual.
+"""The full screen of `rack top`, with keys that command the rack. It needs textual.
 
-It reads rings and words, five times a second. Commands that wait for an answer run in a thread.
+It shows boards, mailboxes, events and lateness, and reads rings and words five times a second.
+Commands that wait for an answer run in a thread.
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ from rack.tools.monitor.snapshot import RackMonitor, Snapshot
 
 LOOK_S = 0.2
 LATE_US = (-np.inf, 20, 50, 100, 200, 500, 1_000, 2_000, 5_000, 10_000, np.inf)
-"""Borders of the classes in which cycles are counted by their lateness."""
+"""Borders of the classes of lateness in which cycles are counted, us."""
 INJECT = "inject"
-"""First word of a fault on the command line; with any other it is a command to that level."""
+"""First word of a fault on the command line. Any other word is the level of a command."""
 OWN_PROCESS = [kind.name for kind in KINDS if kind.where == "core"]
-"""Kinds whose process takes a core: it must not be this one."""
+"""Kinds of faults that keep a core busy with this process, which must not be the screen."""
 
 
 class RackScreen(App[None]):
-    """Shows one rack until its run is over, or `has_ended`."""
+    """Shows one rack until its run is over or `has_ended` returns True."""
 
     CSS = """
     Screen { overflow: hidden; }
@@ -94,7 +94,7 @@ class RackScreen(App[None]):
         }
 
     def compose(self) -> ComposeResult:
-        """Yield the parts of the screen."""
+        """Yield the widgets of the screen."""
         yield Static(id="head")
         yield Static(id="levels")
         with TabbedContent():
@@ -106,12 +106,12 @@ class RackScreen(App[None]):
         yield Footer(compact=True)
 
     def on_mount(self) -> None:
-        """Look at once, and again and again."""
+        """Show the first snapshot, and refresh it periodically."""
         self._look()
         self.set_interval(LOOK_S, self._look)
 
     def _look(self) -> None:
-        """Show the rack as it is now."""
+        """Take a snapshot and show it. Exit when the run is over."""
         if self._segment.run_is_over or self._has_ended():
             self.exit()
             return
@@ -128,7 +128,7 @@ class RackScreen(App[None]):
         self.query_one(f"#{pane} Static", Static).update(self._panes[pane](snapshot))
 
     def _chosen(self, snapshot: Snapshot) -> Text:
-        """Return the levels coloured by state; the one that keys command is reversed."""
+        """Format the levels, coloured by state. The level that keys command is reversed."""
         states = {row.task: row.state for row in snapshot.tasks}
         chosen = {self._levels[0]: "reverse"}
         levels = [
@@ -138,18 +138,20 @@ class RackScreen(App[None]):
         return Text(" > ").join(levels)
 
     def _mailboxes(self, snapshot: Snapshot) -> RenderableType:
+        """Return the table of mailboxes."""
         rows = list_mailboxes(self._segment)
         cells = [[*map(str, row.values())] for row in rows]
         return grid([*rows[0]], cells, self.size.width - GAP, DROPPED)
 
     def _lateness(self, snapshot: Snapshot) -> RenderableType:
+        """Return the table of lateness classes of the selected level."""
         level = self._levels[0]
         classes = zip(LATE_US[1:], self._late[level].tolist(), strict=True)
         rows = [[f"< {border:g}", str(count)] for border, count in classes]
         return grid(("late us", level), rows, self.size.width)
 
     def action_pane(self, number: int) -> None:
-        """Show one pane."""
+        """Show a pane by its number."""
         self.query_one(TabbedContent).active = [*self._panes][number - 1]
 
     def action_level(self) -> None:
@@ -162,15 +164,15 @@ class RackScreen(App[None]):
         self._late.clear()
 
     def action_interrupt(self) -> None:
-        """End as Ctrl-C ends every command."""
+        """End the program as Ctrl-C ends every command."""
         signal.raise_signal(signal.SIGINT)
 
     def action_stop(self) -> None:
-        """Set the emergency stop; the first line shows it."""
+        """Set the emergency stop. The head line shows it."""
         self._lines.latch_emergency_stop()
 
     def action_give(self, what: str) -> None:
-        """Give a command without a goal to the level."""
+        """Give a command without a goal to the selected level."""
         self.action_carry_out([self._levels[0], what])
 
     def action_kinds(self) -> None:
@@ -186,18 +188,18 @@ class RackScreen(App[None]):
         self._open(options)
 
     def on_option_list_option_selected(self, event: OptionList.OptionSelected) -> None:
-        """Write the fault on the command line, where it can be changed before it is sent."""
+        """Write the chosen fault on the command line, where the user can change it."""
         self.action_write(event.option_id or "")
 
     def action_write(self, text: str) -> None:
-        """Open the command line."""
+        """Open the command line with a text."""
         line = self.query_one(Input)
         self._open(line)
         line.value = text
         line.action_end()
 
     def on_input_submitted(self, event: Input.Submitted) -> None:
-        """Carry out what is written."""
+        """Execute the command line."""
         self.action_close()
         self.action_carry_out(event.value.split())
 
@@ -212,11 +214,14 @@ class RackScreen(App[None]):
         widget.focus()
 
     def action_carry_out(self, words: Sequence[str]) -> None:
-        """Carry out a command, and show its answer when it has come."""
+        """Execute a command in a thread, and show its answer when it arrives."""
         self.run_worker(partial(self._answer, words), thread=True)
 
     def _answer(self, words: Sequence[str]) -> None:
-        """Carry out a command, in a thread: its level may take seconds to answer."""
+        """Execute a command and show its answer.
+
+        It runs in a thread, since a level may take seconds.
+        """
         try:
             with as_failure():
                 answer = self._result(words)
@@ -226,14 +231,14 @@ class RackScreen(App[None]):
         self.notify(answer, markup=False)
 
     def _result(self, words: Sequence[str]) -> str:
-        """Return the answer to a command."""
+        """Execute a command and return its answer. Raises `Failure`."""
         match words:
             case ["reset"]:
                 self._lines.reset_emergency_stop()
                 return "the emergency stop is reset"
             case [first, board, kind, *given] if first == INJECT:
                 if kind in OWN_PROCESS:
-                    raise Failure(f"{kind}: needs a process of its own: rack inject")
+                    raise Failure(f"{kind}: needs a separate process; use 'rack inject'")
                 values = dict(word.partition("=")[::2] for word in given)
                 live = LiveRack(self._segment)
                 fault = {"board": board, "kind": kind, **values}
@@ -241,4 +246,4 @@ class RackScreen(App[None]):
             case [level, what, *goal]:
                 command = {"level": level, "what": what, **goal_of(what, goal)}
                 return LiveDesk(self._segment).give(command, wait=False).line
-        raise Failure(f"'{' '.join(words)}': permitted: LEVEL WHAT [GOAL], {INJECT} BOARD KIND ...")
+        raise Failure(f"'{' '.join(words)}': must be LEVEL WHAT [GOAL], or {INJECT} BOARD KIND ...")

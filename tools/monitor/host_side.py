@@ -1,4 +1,4 @@
-"""The host side of a running rack: its boards, and what bus adapters pass between the two sides."""
+"""Describes the host side of a running rack: its boards, and the messages of bus adapters."""
 
 from __future__ import annotations
 
@@ -13,17 +13,22 @@ from rack.backplane.words import Block, Box, TaskState
 from rack.tools.monitor.newest_messages import Newest
 
 ADAPTER_STATUS = "adapter_status"
-"""Message type of the status of a bus adapter: a group of counts for each entry."""
+"""Message type of the status of a bus adapter, with a group of counts for each entry."""
 ENTRY_COUNTS = ("passed", "refused", "superseded", "full", "waiting")
-"""What is counted of an entry."""
+"""Names of the counts of an entry."""
 AWAY = "away"
-"""State of a host board that no process runs: an external one, or one that is being restarted."""
+"""State of a host board without a process: an external one, or one that is being restarted."""
 DONE = "done"
 
 
 @dataclass(frozen=True)
 class HostRow:
-    """A host board now: `pid` is 0 while no process runs it, `sent` counts its messages."""
+    """A host board now.
+
+    Attributes:
+        pid: Process id. 0 without a process.
+        sent: Number of messages sent.
+    """
 
     board: str
     pid: int
@@ -34,8 +39,10 @@ class HostRow:
 
 @dataclass(frozen=True)
 class EntryRow:
-    """One entry of a bus adapter: its counts, and the age of its newest message, simulated ms;
-    None: none yet.
+    """An entry of a bus adapter, with its counts.
+
+    Attributes:
+        age_ms: Age of its newest message in simulated time. None before the first message.
     """
 
     entry: str
@@ -49,36 +56,37 @@ class EntryRow:
 
 
 def host_rows(segment: Segment) -> tuple[HostRow, ...]:
-    """Return the host boards."""
-    found = []
+    """List the host boards."""
+    rows = []
     for host in segment.layout.hosts:
         block = segment.block(host.name)
         # The process that runs a host board locks this word, and the kernel unlocks it.
-        runs = segment.is_locked(segment.map.blocks[host.name] + 8 * Block.PID)
-        state = as_named(TaskState, block[Block.STATE]).name.lower() if runs else AWAY
+        is_running = segment.is_locked(segment.map.blocks[host.name] + 8 * Block.PID)
+        state = as_named(TaskState, block[Block.STATE]).name.lower() if is_running else AWAY
         if block[Block.STATE] == TaskState.ENDED:
             state = DONE
         sent = sum(head[Box.HEAD] for head in _heads(segment, host.name))
-        pid = block[Block.PID] if runs else 0
-        found.append(HostRow(host.name, pid, state, sent, restarts(segment, host.name)))
-    return tuple(found)
+        pid = block[Block.PID] if is_running else 0
+        rows.append(HostRow(host.name, pid, state, sent, restarts(segment, host.name)))
+    return tuple(rows)
 
 
 def restarts(segment: Segment, writer: str) -> int:
-    """Return how often a new process took over the mailboxes of a task or host board: each writes
-    in a new epoch.
+    """Count how often a new process took over the mailboxes of a task or host board.
+
+    Each process writes in a new epoch.
     """
     return max([0, *(head[Box.EPOCH] - 1 for head in _heads(segment, writer))])
 
 
 def _heads(segment: Segment, writer: str) -> list[memoryview]:
-    """Return the words of the mailboxes that a task or host board writes."""
+    """List the words of the mailboxes that a task or host board writes."""
     return [segment.box(box.name) for box in segment.layout.mailboxes if box.writer == writer]
 
 
 def entry_rows(newest: Newest) -> tuple[EntryRow, ...]:
-    """Return the entries of all bus adapters."""
-    found: list[EntryRow] = []
+    """List the entries of all bus adapters."""
+    rows: list[EntryRow] = []
     segment = newest.segment
     tick_ms = segment.layout.clock_ns * 1e-6
     for mailbox, entry, source in entries_of(segment.layout, segment.config):
@@ -88,13 +96,16 @@ def entry_rows(newest: Newest) -> tuple[EntryRow, ...]:
             age_ms = None if age < 0 else age * tick_ms
             numbers = {name: int(counts[name]) for name in ENTRY_COUNTS}
             board = mailbox.partition(".")[0]
-            found.append(EntryRow(f"{board}.{entry}", source, **numbers, age_ms=age_ms))
-    return tuple(found)
+            rows.append(EntryRow(f"{board}.{entry}", source, **numbers, age_ms=age_ms))
+    return tuple(rows)
 
 
 def entries_of(layout: Layout, config: str) -> Iterator[tuple[str, str, str]]:
-    """Yield status mailbox, name and source of every entry of a rack's bus adapters; `config` is
-    TOML text.
+    """Yield status mailbox, name and source of every entry of a rack's bus adapters.
+
+    Args:
+        layout: Layout of the rack.
+        config: Its config, as TOML text.
     """
     boxes = [box.name for box in layout.mailboxes if box.message == ADAPTER_STATUS]
     boards = load_toml(config)["board"] if boxes else {}

@@ -1,6 +1,4 @@
-"""What interrupted the boards of a rack, under protocol interrupt: now, and message by message in a
-run.
-"""
+"""Describes the interrupts of boards under protocol interrupt, live or in a run."""
 
 from __future__ import annotations
 
@@ -21,13 +19,18 @@ if TYPE_CHECKING:
     from rack.tools.recording.recording import Recording
 
 LOST = np.iinfo(np.int64).max
-"""End of service of a message that was lost in the inbox."""
+"""End of service of a message that was lost because the inbox was full."""
 
 
 @dataclass(frozen=True)
 class InboxFill:
-    """The inbox of a board, so far: messages `served` and `lost`, and the most that waited, of at
-    most `depth`.
+    """The inbox of a board so far.
+
+    Attributes:
+        served: Number of messages that interrupted the board.
+        lost: Number of messages that found the inbox full.
+        waiting: Largest number of messages that waited at once.
+        depth: Capacity of the inbox.
     """
 
     board: str
@@ -38,7 +41,7 @@ class InboxFill:
 
     @property
     def line(self) -> str:
-        """The inbox as one line."""
+        """The inbox as one line of text."""
         lost = f", {self.lost} lost" if self.lost else ""
         return (
             f"interrupts of {self.board}: {self.served} served, at most {self.waiting} of"
@@ -50,74 +53,77 @@ def inbox_depths(layout: Layout) -> dict[int, int]:
     """Return the depth of the inbox of every board that messages interrupt, by slot."""
     slots = dict.fromkeys(task.slot for task in layout.tasks)
     boxes = {slot: layout.interrupting(slot) for slot in slots}
-    return {slot: how_sent(found[0]).depth for slot, found in boxes.items() if found}
+    return {
+        slot: how_sent(interrupting[0]).depth
+        for slot, interrupting in boxes.items()
+        if interrupting
+    }
 
 
 def inbox_fills(segment: Segment) -> tuple[InboxFill, ...]:
-    """Return the inbox of every board that messages interrupt, as it is now."""
-    found = []
+    """Describe the current inbox of every board that messages interrupt."""
+    fills = []
     for slot, depth in inbox_depths(segment.layout).items():
         board = segment.layout.handler(slot)
         block = segment.block(board)
         served, lost = block[Block.INTERRUPTS], block[Block.INTERRUPTS_LOST]
-        found.append(InboxFill(board, served, lost, block[Block.INTERRUPTS_WAITING], depth))
-    return tuple(found)
+        fills.append(InboxFill(board, served, lost, block[Block.INTERRUPTS_WAITING], depth))
+    return tuple(fills)
 
 
 class Arrivals(NamedTuple):
-    """The messages that interrupted a board, mailbox after mailbox; times in ns of simulated time
-    since tick 0. Arrays have shape (n,).
+    """The messages that interrupted a board, mailbox after mailbox. Arrays have shape (n,).
+
+    Times are in ns of simulated time since tick 0.
     """
 
     mailbox: np.ndarray  # number of the mailbox, as `Layout.interrupting` counts
     sent_ns: np.ndarray
-    end_ns: np.ndarray  # of the service; `LOST` where the inbox was full
+    end_ns: np.ndarray  # end of service; `NEVER_SERVED` if the inbox was full
     most_waiting: int
 
 
 def replay_inbox(recording: Recording, slot: int) -> Arrivals:
-    """Work the inbox of the board in a slot out again from the messages of a run, as the board
-    did.
-    """
+    """Recompute the inbox of the board in a slot from the messages of a run."""
     layout = recording.layout
     boxes = layout.interrupting(slot)
     sent = []
     for box in boxes:
         visible_at = recording.signal(box.name, "visible_at").astype(np.int64)
-        # A message that comes after a later one of its mailbox is sent with that.
+        # A message that overtakes an earlier one of its mailbox waits for it.
         newest = np.maximum.accumulate(visible_at * layout.clock_ns)
         sent.append(newest + sent_ns(box, layout.clock_ns))
     times = np.concatenate(sent)
-    numbers = np.repeat(np.arange(len(boxes)), [len(at) for at in sent])
+    numbers = np.repeat(np.arange(len(boxes)), [len(index) for index in sent])
     ends = np.full(len(times), LOST)
     inbox = Inbox(how_sent(boxes[0]).depth)
     services = [how_sent(box).service_ns for box in boxes]
-    for at in np.lexsort((numbers, times)).tolist():
-        end_ns = inbox.arrive(int(times[at]), services[numbers[at]])
+    for index in np.lexsort((numbers, times)).tolist():
+        end_ns = inbox.arrive(int(times[index]), services[numbers[index]])
         if end_ns is not None:
-            ends[at] = end_ns
+            ends[index] = end_ns
     return Arrivals(numbers, times, ends, inbox.most_waiting)
 
 
 def interrupts(recording: Recording) -> list[Document]:
-    """Return what interrupted every board in a run: messages served and lost, the most that waited,
-    latencies.
+    """Describe the interrupts of every board in a run, as plain data.
 
-    A latency, us, is the time from sending a message to the end of its service; then a level can
-    see it.
+    A latency, us, is the time from sending a message to the end of its service, when a level can
+    see
+    it.
     """
     layout = recording.layout
-    found = []
+    documents = []
     for slot, depth in inbox_depths(layout).items():
         arrivals = replay_inbox(recording, slot)
         is_served = arrivals.end_ns != LOST
         boxes = layout.interrupting(slot)
         served, lost = (
-            np.bincount(arrivals.mailbox[part], minlength=len(boxes)).tolist()
-            for part in (is_served, ~is_served)
+            np.bincount(arrivals.mailbox[mask], minlength=len(boxes)).tolist()
+            for mask in (is_served, ~is_served)
         )
         latency_ns = (arrivals.end_ns - arrivals.sent_ns)[is_served]
-        found.append(
+        documents.append(
             {
                 "board": layout.handler(slot),
                 "depth": depth,
@@ -131,4 +137,4 @@ def interrupts(recording: Recording) -> list[Document]:
                 ],
             }
         )
-    return found
+    return documents

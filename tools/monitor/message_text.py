@@ -1,6 +1,4 @@
-"""The mailboxes of a rack as rows, and a message as a document, and as lines for people, field by
-field with units.
-"""
+"""Formats the mailboxes of a rack as rows, and a message field by field with units."""
 
 from __future__ import annotations
 
@@ -20,7 +18,7 @@ DROPPED = ("bytes", "message", "protocol", "readers")
 
 
 def list_mailboxes(segment: Segment) -> list[Document]:
-    """Return a row of each mailbox of a rack."""
+    """Return a row of plain data for each mailbox of a rack."""
     return [
         {
             "mailbox": box.name,
@@ -37,7 +35,7 @@ def list_mailboxes(segment: Segment) -> list[Document]:
 
 
 class MessageText:
-    """Shows the messages of one mailbox of a rack whose ticks last `clock_ns`."""
+    """Formats the messages of one mailbox. The ticks of its rack last `clock_ns`."""
 
     def __init__(self, box: MailboxSpec, clock_ns: int) -> None:
         self._box = box
@@ -45,7 +43,12 @@ class MessageText:
         self._signals = signals_of(box)
 
     def document(self, row: np.ndarray, tick: int) -> Document:
-        """Return a message, a row of the mailbox's ring, as a document, as of `tick`."""
+        """Convert a message to a document.
+
+        Args:
+            row: Row of the mailbox's ring.
+            tick: Current tick, for the age of the message.
+        """
         message = row["message"][None]
         return {
             "mailbox": self._box.name,
@@ -55,7 +58,7 @@ class MessageText:
         }
 
     def lines(self, document: Document) -> list[str]:
-        """Return a message as lines for people."""
+        """Format the document of a message as lines for people."""
         age_ms = document["age_ticks"] * self._clock_ns * 1e-6
         head = (
             f"{self._box.name}: serial {document['serial']}, of tick {document['tick']},"

@@ -1,4 +1,4 @@
-"""A running rack's exchange with others over the network: which are there, and what passes."""
+"""Describes a running rack's exchange with other racks over the network."""
 
 from __future__ import annotations
 
@@ -24,13 +24,16 @@ COUNTS = (
     "unknown_launch",
     "superseded",
 )
-"""What is counted of an import: see `rack.boards.lan.adapter.IMPORT`."""
+"""Names of the counts of an import: see `rack.boards.lan.adapter.IMPORT`."""
 
 
 @dataclass(frozen=True)
 class PeerRow:
-    """Another rack now. `clock_ms` is its clock less ours, within `within_ms`, ms; None: not known,
-    or in lockstep.
+    """Another rack now.
+
+    Attributes:
+        clock_ms: Its clock minus the clock of this rack. None if unknown, or in lockstep.
+        within_ms: Uncertainty of `clock_ms`.
     """
 
     peer: str
@@ -44,8 +47,11 @@ class PeerRow:
 
 @dataclass(frozen=True)
 class ImportRow:
-    """One import now: its counts, and the age of its information in ticks here and in s of
-    simulated time.
+    """An import now, with its counts.
+
+    Attributes:
+        age_ticks: Age of its information in ticks of this rack. None before the first message.
+        age_s: The same in simulated time.
     """
 
     entry: str
@@ -64,7 +70,7 @@ class ImportRow:
 
 @dataclass(frozen=True)
 class ExportRow:
-    """One export now."""
+    """An export now."""
 
     entry: str
     source: str
@@ -72,9 +78,7 @@ class ExportRow:
 
 
 class Entries(NamedTuple):
-    """What a rack exchanges: the source of each export and import by port, and the racks with which
-    it works.
-    """
+    """Exports and imports of a rack, with the source by port, and its partner racks."""
 
     exports: dict[str, str]
     imports: dict[str, str]
@@ -83,7 +87,7 @@ class Entries(NamedTuple):
 
 @cache
 def exchanged(config: str) -> Entries | None:
-    """Return what a rack exchanges by its config, TOML text; None: it has no network adapter."""
+    """Read from a config, as TOML text, what a rack exchanges. None without a network adapter."""
     table: dict[str, Any] | None = load_toml(config).get("adapter", {}).get(BOARD)
     if table is None:
         return None
@@ -96,32 +100,32 @@ def exchanged(config: str) -> Entries | None:
 
 
 def _entries(segment: Segment) -> Entries:
-    """Return what a rack exchanges; nothing in a rack without a network adapter."""
+    """Return what a rack exchanges. Empty without a network adapter."""
     has_adapter = any(task.name == BOARD for task in segment.layout.tasks)
     return (exchanged(segment.config) if has_adapter else None) or Entries({}, {}, ())
 
 
 def peer_rows(newest: Newest) -> tuple[PeerRow, ...]:
-    """Return the other racks."""
+    """List the other racks with which a rack works."""
     racks = _entries(newest.segment).peers
-    seen = ((rack, newest.message(f"{BOARD}.{peer_port(rack)}")) for rack in racks)
-    return tuple(_peer(rack, message) for rack, message in seen if message is not None)
+    peers = ((rack, newest.message(f"{BOARD}.{peer_port(rack)}")) for rack in racks)
+    return tuple(_peer(rack, message) for rack, message in peers if message is not None)
 
 
 def import_rows(newest: Newest) -> tuple[ImportRow, ...]:
-    """Return the imports."""
-    found = []
+    """List the imports of a rack."""
+    rows = []
     for port, source, counts in _groups(newest, "import", _entries(newest.segment).imports):
         age = int(counts["age"])
         ages = (None, None) if age < 0 else (age, float(counts["age_s"]))
         numbers = {name: int(counts[name]) for name in COUNTS}
         entry = f"{BOARD}.{port}"
-        found.append(ImportRow(entry, source, **numbers, age_ticks=ages[0], age_s=ages[1]))
-    return tuple(found)
+        rows.append(ImportRow(entry, source, **numbers, age_ticks=ages[0], age_s=ages[1]))
+    return tuple(rows)
 
 
 def export_rows(newest: Newest) -> tuple[ExportRow, ...]:
-    """Return the exports."""
+    """List the exports of a rack."""
     return tuple(
         ExportRow(f"{BOARD}.{port}", source, int(counts["sent"]))
         for port, source, counts in _groups(newest, "export", _entries(newest.segment).exports)
@@ -131,14 +135,21 @@ def export_rows(newest: Newest) -> tuple[ExportRow, ...]:
 def _groups(
     newest: Newest, kind: str, sources: Mapping[str, str]
 ) -> Iterator[tuple[str, str, Any]]:
-    """Yield port, source and counts of all imports or exports, once the adapter has counted."""
+    """Yield port, source and counts of all imports or exports, once the adapter has counted.
+
+    Args:
+        newest: Reads the status of the adapter.
+        kind: "import" or "export".
+        sources: Source by port.
+    """
     if (status := newest.message(STATUS)) is not None:
         for port, source in sources.items():
             yield port, source, getattr(status, f"{kind}_{port}")
 
 
-def _peer(rack: str, at: Any) -> PeerRow:
-    is_known = at.uncertainty > 0.0
-    clock = (at.offset * 1e3, at.uncertainty * 1e3) if is_known else (None, None)
-    state = Presence(at.presence).name.lower()
-    return PeerRow(rack, state, at.since, at.launches, at.losses, *clock)
+def _peer(rack: str, message: Any) -> PeerRow:
+    """Convert a message about another rack to a row."""
+    is_known = message.uncertainty > 0.0
+    clock = (message.offset * 1e3, message.uncertainty * 1e3) if is_known else (None, None)
+    state = Presence(message.presence).name.lower()
+    return PeerRow(rack, state, message.since, message.launches, message.losses, *clock)

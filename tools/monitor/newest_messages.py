@@ -1,4 +1,4 @@
-"""The newest messages in the mailboxes of a running rack."""
+"""Reads the newest messages in the mailboxes of a running rack."""
 
 from __future__ import annotations
 
@@ -12,14 +12,20 @@ from rack.backplane.segment import Segment
 
 
 class Newest:
-    """Reads newest messages. It opens each mailbox once: that takes longer than many reads."""
+    """Reads the newest message of any mailbox.
+
+    Each mailbox is opened only once, because opening takes longer than many reads.
+    """
 
     def __init__(self, segment: Segment) -> None:
         self.segment = segment
         self._readers: dict[str, Reader] = {}
 
     def message(self, mailbox: str) -> AnyMessage | None:
-        """Return the newest message of a mailbox; None without one, or without the mailbox."""
+        """Return the newest message of a mailbox.
+
+        None without a message, or without the mailbox.
+        """
         if mailbox not in self.segment.map.mailboxes:
             return None
         if mailbox not in self._readers:
@@ -30,13 +36,16 @@ class Newest:
     def messages(
         self, is_wanted: Callable[[MailboxSpec], bool]
     ) -> Iterator[tuple[str, AnyMessage]]:
-        """Yield the newest message of every wanted mailbox that has one, with its writer."""
+        """Yield the writer and the newest message of every wanted mailbox that has one."""
         for box in self.segment.layout.mailboxes:
             if is_wanted(box) and (message := self.message(box.name)) is not None:
                 yield box.writer, message
 
     def statuses(self, field: str) -> Iterator[tuple[str, AnyMessage]]:
-        """Yield the newest status of every level whose status has a field, with the level."""
+        """Yield the level and the newest status of every level whose status has a field."""
         return self.messages(
-            lambda box: box.name.endswith(".status") and field in (own.name for own in box.fields)
+            lambda box: (
+                box.name.endswith(".status")
+                and field in (box_field.name for box_field in box.fields)
+            )
         )

@@ -1,5 +1,7 @@
-"""A rack that is paused, and goes on: in lockstep between two ticks, by single ticks or cycles as
-well; in real time by the operator's hold.
+"""Pauses a rack, and lets it continue.
+
+In lockstep the rack is held between two ticks, and can be stepped by ticks or cycles. In real time
+an operator's hold stops its arm.
 """
 
 from __future__ import annotations
@@ -17,11 +19,12 @@ from rack.tools.monitor.desk import LiveDesk
 from rack.tools.monitor.snapshot import RackMonitor
 
 LOOK_S = 0.001
+"""Time between two checks whether the rack holds."""
 
 
 @dataclass(frozen=True)
 class Stepped:
-    """A rack that is held. `levels` has one dict a level: level, state, row, reason."""
+    """A rack that is held. `levels` has a row for each level, with its state, row and reason."""
 
     rack: str
     tick: int
@@ -29,13 +32,13 @@ class Stepped:
     levels: list[dict[str, str]]
 
     def lines(self) -> Iterator[str]:
-        """Yield the same as readable text."""
+        """Yield the lines of the answer for people."""
         yield f"{self.rack}: held before tick {self.tick}, {self.time_s:.3f} s"
         yield from fitted_records(self.levels)
 
 
 class Stepper:
-    """Steps one rack. Raises `Failure` when it is not in lockstep."""
+    """Steps one rack. Raises `Failure` if it does not run in lockstep."""
 
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
@@ -48,25 +51,30 @@ class Stepper:
             raise Failure(f"rack '{segment.rack}' runs in real time, which cannot be held; {hint}")
 
     def let_go(self) -> None:
-        """Let the rack run on."""
+        """Let the rack run without holding."""
         self._words[System.HOLD_AT] = 0
 
     def hold(self) -> int:
-        """Hold the rack, if it is not held yet; return the tick before which it holds."""
+        """Hold the rack if it is not held yet. Returns the tick before which it holds."""
         if not self._words[System.HOLD_AT]:
             self._words[System.HOLD_AT] = 1
         return self._await_hold(0)
 
     def go(self, tick: int) -> None:
-        """Let the rack go on, and hold it before `tick`."""
+        """Let the rack continue, and hold it before `tick`."""
         self._words[System.HOLD_AT] = tick + 1
         self._await_hold(tick)
 
     def after_cycles(self, at: int, cycles: int, level: str | None) -> int:
-        """Return the tick after the release of the last of `cycles` of a level, or of the slowest
-        level.
+        """Compute the tick after the release of the last of some cycles.
 
-        Raises `Failure` for an unknown level.
+        Args:
+            at: The current tick.
+            cycles: Number of cycles.
+            level: The level whose cycles count. None for the slowest one.
+
+        Raises:
+            Failure: The level is unknown.
         """
         if level is None:
             task = max(self._executors.values(), key=lambda task: task.every)
@@ -74,11 +82,11 @@ class Stepper:
             task = self._executors[level]
         else:
             known = ", ".join(self._executors)
-            raise Failure(f"--until {level}: no such level; levels: {known}", 2)
+            raise Failure(f"--until {level}: no such level; valid levels: {known}", 2)
         return task.grid.since(at) + (cycles - 1) * task.every + 1
 
     def look(self) -> Stepped:
-        """Return the rack as it is held."""
+        """Describe the rack as it is held."""
         levels = [
             {"level": row.task, "state": row.state, "row": row.row, "reason": row.reason}
             for row in RackMonitor(self._segment).look().tasks
@@ -89,36 +97,41 @@ class Stepper:
         return Stepped(self._segment.rack, tick, time_s, levels)
 
     def _await_hold(self, tick: int) -> int:
-        """Wait until the rack holds before `tick` or a later one; return which."""
-        while (held := self._words[System.HELD] - 1) < tick:
+        """Wait until the rack holds before `tick` or a later one, and return that tick."""
+        while (held_tick := self._words[System.HELD] - 1) < tick:
             if self._segment.run_is_over:
                 raise Failure(
                     f"rack '{self._segment.rack}': its run ended at tick {self._words[System.TICK]}"
                 )
             time.sleep(LOOK_S)
-        return held
+        return held_tick
 
 
 class Pause(NamedTuple):
-    """A pause: before `tick` in lockstep, otherwise from it on, with the `levels` held for it."""
+    """A pause of a rack.
+
+    Attributes:
+        tick: In lockstep the tick before which it holds, otherwise the tick of the hold.
+        levels: Levels that are held. Empty in lockstep.
+    """
 
     tick: int
     levels: list[str]
 
 
 def pause(segment: Segment) -> Pause:
-    """Pause a rack, and return when it is held, or its arm at rest.
+    """Pause a rack, and return once it is held or its arm is at rest.
 
-    Raises `Failure` where no level is above all others that take a hold, or it is refused.
+    Raises `Failure` if the hold is refused, or if no single level is above all others.
     """
     if segment.words[System.LOCKSTEP]:
         return Pause(Stepper(segment).hold(), [])
     desk = LiveDesk(segment)
     levels = desk.highest("", "hold")
     if len(levels) != 1:
-        found = ", ".join(levels) or "none"
-        needed = "of the levels that take a hold one must be above all others"
-        raise Failure(f"rack '{segment.rack}' runs in real time: {needed}; highest: {found}")
+        highest = ", ".join(levels) or "none"
+        needed = "one of the levels that can hold must be above all others"
+        raise Failure(f"rack '{segment.rack}' runs in real time: {needed}; highest: {highest}")
     reply = desk.give({"level": levels[0], "what": "hold"}, wait=True)
     if reply.fate != "done":
         raise Failure(reply.line)
@@ -126,8 +139,9 @@ def pause(segment: Segment) -> Pause:
 
 
 def resume(segment: Segment) -> list[str]:
-    """Let a paused rack go on; return the levels that were held. Raises `Failure` when it is not
-    paused.
+    """Let a paused rack continue. Returns the levels that were held.
+
+    Raises `Failure` if the rack is not paused.
     """
     words = segment.words
     levels: list[str] = []

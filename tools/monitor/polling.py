@@ -1,4 +1,4 @@
-"""Repeated looks at a running rack."""
+"""Repeated readings of a running rack."""
 
 from __future__ import annotations
 
@@ -10,12 +10,17 @@ from rack.tools.console.interrupt import INTERRUPT
 
 
 def looks(segment: Segment, look_s: float) -> Iterator[bool]:
-    """Yield again and again whether the run is over, until it is, or a signal asks for the end."""
+    """Yield at regular intervals whether the run is over, until it is or a signal arrives.
+
+    Args:
+        segment: The rack.
+        look_s: Time between two readings.
+    """
     ended = threading.Event()
     is_last = False
     with INTERRUPT.orderly(ended.set):
         while not is_last:
-            # Asked before the look: what is written until the end is seen.
+            # Read this before the caller reads messages, so that it sees all up to the end.
             is_over = segment.run_is_over
             is_last = is_over or ended.wait(look_s)
             yield is_over

@@ -1,4 +1,4 @@
-"""How full the queues of a rack are, and were in a run."""
+"""Describes how full the queues of a rack are, or were in a run."""
 
 from __future__ import annotations
 
@@ -18,8 +18,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class QueueFill:
-    """A queue now: `unread` messages, of at most `capacity`, and how many were refused so far
-    because it was full.
+    """A queue now.
+
+    Attributes:
+        unread: Number of messages in it.
+        capacity: Largest possible number.
+        refused: Number of messages refused so far because the queue was full.
     """
 
     mailbox: str
@@ -29,37 +33,38 @@ class QueueFill:
 
     @property
     def line(self) -> str:
-        """The queue as one line."""
+        """The queue as one line of text."""
         refused = f", {self.refused} refused" if self.refused else ""
         return f"queue {self.mailbox}: {self.unread} of {self.capacity} unread{refused}"
 
 
 def queue_fills(newest: Newest) -> tuple[QueueFill, ...]:
-    """Return every queue of a rack as it is now."""
-    found = []
+    """Describe every queue of a rack as it is now."""
+    fills = []
     for box in queues_of(newest.segment.layout):
-        # The position first: what is taken meanwhile was in the queue.
+        # Read the position first: messages taken after this still count as unread.
         position = newest.message(taken_name(box.name))
         words = newest.segment.box(box.name)
         unread = words[Box.SENT] - (0 if position is None else position.taken)
-        found.append(QueueFill(box.name, unread, box.capacity, words[Box.REFUSED]))
-    return tuple(found)
+        fills.append(QueueFill(box.name, unread, box.capacity, words[Box.REFUSED]))
+    return tuple(fills)
 
 
 def queues(recording: Recording) -> list[Document]:
-    """Return what went through every queue: messages `sent`, `refused` (None: not recorded), most
-    that ever waited.
+    """Describe the traffic of every queue in a run, as plain data.
 
-    `waiting` counts the messages that a read could see, before it took any.
+    `waiting` is the largest number of messages that a read saw before it took any. `refused` is
+    None if
+    it was not recorded.
     """
     refused = recording.ended.get("refused", {})
-    found = []
+    documents = []
     for box in queues_of(recording.layout):
         taken, unread = (
             recording.signal(taken_name(box.name), field) for field in ("taken", "unread")
         )
         before = np.concatenate(([0], taken[:-1]))
-        found.append(
+        documents.append(
             {
                 "mailbox": box.name,
                 "capacity": box.capacity,
@@ -69,4 +74,4 @@ def queues(recording: Recording) -> list[Document]:
                 "refused": refused.get(box.name),
             }
         )
-    return found
+    return documents

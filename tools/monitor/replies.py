@@ -1,4 +1,4 @@
-"""What becomes of a command to a level of a running rack, read from the statuses of the level."""
+"""Follows a command to a level of a running rack in the statuses of the level."""
 
 from __future__ import annotations
 
@@ -15,21 +15,30 @@ from rack.backplane.words import Block
 from rack.levels.operator import DRIVES, SETTINGS, Answer
 
 REPLY_CYCLES = 4
-"""Cycles that a level does within which it replies: one to read, one to become visible, one for an
-answer to another operator, and one that was under way."""
+"""Number of a level's cycles within which it replies.
+
+One reads the command, one makes the reply visible, one may answer another operator, and one may be
+under way.
+"""
 NO_CYCLE_S = 1.0
-"""Simulated time without a cycle of a level after which it is not waited for."""
+"""A level without a cycle for this simulated time is not waited for."""
 
 Fate = Literal["waiting", "given", "taken", "done", "refused", "superseded"]
+"""State of a command."""
 
 
 @dataclass(frozen=True)
 class Reply:
-    """A command and its fate. `given`, `taken_up` and `done` are ticks; -1: not yet, or never.
+    """A command and its fate.
 
-    The fate "waiting" is that of a command to a rack that is held; it has no serial yet, and
-    `waits` says until when. The fate stays "given" where the level's status does not answer
-    operators. `objection` is why it was refused.
+    `given`, `taken_up` and `done` are ticks, or -1 if that has not happened.
+
+    Attributes:
+        serial: Number of the command. 0 while it waits.
+        fate: "waiting" for a command to a rack that is held. It stays "given" if the status of the
+            level does not answer operators.
+        objection: Why the command was refused.
+        waits: How long a waiting command must wait.
     """
 
     serial: int
@@ -44,17 +53,17 @@ class Reply:
 
     @property
     def worked(self) -> bool:
-        """Whether it was not refused."""
+        """True unless the command was refused."""
         return self.fate != "refused"
 
     @property
     def is_standing(self) -> bool:
-        """Whether it is in force, as far as is known."""
+        """True if the command is known to be in force."""
         return self.fate in ("taken", "done")
 
     @property
     def line(self) -> str:
-        """All of it as one line."""
+        """The reply as one line of text."""
         if self.fate == "waiting":
             return f"command to '{self.level}', {self.text}: {self.waits}"
         ends = {
@@ -71,7 +80,7 @@ class Reply:
 
 
 def answering(segment: Segment, level: str) -> MailboxSpec | None:
-    """Return the status mailbox of a level; None where its status does not answer operators."""
+    """Find the status mailbox of a level. None if the status does not answer operators."""
     boxes = [box for box in segment.layout.mailboxes if box.name == f"{level}.status"]
     return next(
         (box for box in boxes if {"order", "answer", "objection"} <= {f.name for f in box.fields}),
@@ -80,32 +89,36 @@ def answering(segment: Segment, level: str) -> MailboxSpec | None:
 
 
 class Replies:
-    """Follows a level's statuses, message by message, for their reply to one command.
+    """Reads the statuses of a level for its reply to one command.
 
-    A newer command replaces it once the level has accepted that one, unless it is a setting, or one
-    to the drives while this one is not.
+    A newer command supersedes it once the level has accepted that one, except that settings
+    supersede
+    nothing, and commands to the drives supersede only each other.
+
+    Attributes:
+        reply: The reply according to the statuses read so far.
     """
 
     def __init__(self, segment: Segment, status: MailboxSpec, reply: Reply) -> None:
         self._ring = MailboxRing(segment, status.name)
         self._given = MailboxRing(segment, f"{reply.level}.operator")
         self._kinds: dict[int, int] = {}
-        """What each command given to the level is, by serial."""
-        self.reply = reply  # as of the last look
+        """Kind of each command given to the level, by serial."""
+        self.reply = reply
 
     def look(self) -> Reply:
         """Read the statuses written since the last call."""
         rows = self._ring.drain().rows
-        # After the statuses: what they answer was given before.
-        given = self._given.drain().rows["message"]
-        self._kinds.update(zip(given["id"].tolist(), given["what"].tolist(), strict=True))
+        # Read the commands after the statuses: a command is always older than its answer.
+        commands = self._given.drain().rows["message"]
+        self._kinds.update(zip(commands["id"].tolist(), commands["what"].tolist(), strict=True))
         for row in rows:
             if self.reply.fate in ("given", "taken"):
                 self.reply = self._judge(int(row["tick"]), row["message"])
         return self.reply
 
     def _judge(self, tick: int, status: np.void) -> Reply:
-        """Return the reply as of one status."""
+        """Return the reply according to one status."""
         reply = self.reply
         answer = status["answer"]
         if status["order"] == reply.serial:
@@ -122,7 +135,7 @@ class Replies:
         return reply
 
     def _replaces(self, serial: int) -> bool:
-        """Return whether a newer command, accepted, takes this one's place."""
+        """Return whether a newer accepted command supersedes this one."""
         kind = self._kinds.get(serial)
         if kind in SETTINGS:
             return False
@@ -130,8 +143,9 @@ class Replies:
 
 
 class LastCycle:
-    """Knows when a level should have answered: by the cycles that it did, not by ticks, of which a
-    level on a busy machine skips some.
+    """Detects that a level should have answered a command by now.
+
+    It counts cycles instead of ticks, because a level on a busy machine skips some of its releases.
     """
 
     def __init__(self, segment: Segment, status: MailboxSpec) -> None:
@@ -143,13 +157,13 @@ class LastCycle:
         self._silent = max(REPLY_CYCLES * status.every, shortest)
 
     def passed(self, tick: int) -> str:
-        """Return why no answer will come, as of `tick`; empty: it may still come."""
+        """Return why no answer will come, or an empty text while one may still come."""
         cycles = self._block[Block.CYCLES]
         if cycles != self._cycles:
             self._cycles = cycles
             self._since = tick
         if cycles > self._bound:
-            return f"has not answered in {REPLY_CYCLES} of its cycles"
+            return f"has not answered within {REPLY_CYCLES} cycles"
         if tick - self._since > self._silent:
-            return f"has not answered, and done no cycle since tick {self._since}"
+            return f"has not answered, and has not completed a cycle since tick {self._since}"
         return ""

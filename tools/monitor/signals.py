@@ -1,5 +1,6 @@
-"""Signals of a running rack as they are written, from the rings of their mailboxes: no message is
-missed, and no board is held up.
+"""Follows signals of a running rack in the rings of their mailboxes.
+
+No message is missed, and no board is delayed.
 """
 
 from __future__ import annotations
@@ -19,12 +20,14 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 Rows = list[tuple[int, list[Any]]]
-"""Ticks, and the value of each signal at each; None before a signal's first one."""
+"""Ticks with the value of each signal. A value is None before the first message of its signal."""
 
 
 class Written(NamedTuple):
-    """Messages of one mailbox, oldest first, with the ticks at which they were released; before
-    them, `lost` were overwritten.
+    """Messages of one mailbox, oldest first, with the ticks at which they were released.
+
+    Attributes:
+        lost: Number of messages before them that were overwritten.
     """
 
     mailbox: str
@@ -34,15 +37,16 @@ class Written(NamedTuple):
 
 
 class SignalTap:
-    """Takes what is written to the mailboxes of some signals."""
+    """Reads all new messages in the mailboxes of some signals."""
 
     def __init__(self, segment: Segment, signals: Sequence[Signal]) -> None:
         names = dict.fromkeys(signal.mailbox for signal in signals)
         self._rings = {name: MailboxRing(segment, name) for name in names}
 
     def take(self) -> Iterator[Written]:
-        """Yield what was written since the last call; at the first one, what the rings still hold:
-        2 s of simulated time.
+        """Yield the messages since the last call.
+
+        The first call yields what the rings hold: 2 s.
         """
         for name, ring in self._rings.items():
             rows, lost = ring.drain()
@@ -54,8 +58,14 @@ class Strip:
     """The last values of some signals by tick. A signal keeps its value until its next message.
 
     Attributes:
-        settles: Ticks after which everything released at a tick has been written.
-        lost: Messages that were overwritten before they were taken.
+        settles: Number of ticks after which everything released at a tick has been written.
+        lost: Number of messages that were overwritten before they were taken.
+
+    Args:
+        segment: The rack.
+        signals: Signals to keep.
+        span: Number of ticks to keep, with one more message of each mailbox before them.
+        followed: Signals whose messages `read_new` returns without keeping them.
     """
 
     def __init__(
@@ -65,45 +75,50 @@ class Strip:
         span: int,
         followed: Sequence[Signal] = (),
     ) -> None:
-        """Keep `span` ticks, and for each mailbox the message before them; of signals that are only
-        `followed`, nothing.
-        """
+        """Start to keep the signals."""
         specs = [segment.layout.mailbox(signal.mailbox) for signal in signals]
         self.signals = signals
         self.tick_s = segment.layout.clock_ns * 1e-9
-        # A message is written before its writer's next period, and visible then.
+        # A message is written, and becomes visible, before its writer's next period.
         self.settles = max(spec.every + spec.delay for spec in specs)
-        # One look may bring as much as a ring holds.
+        # One reading may return as much as a ring holds.
         self._span = span + self.settles + max(spec.every * spec.depth for spec in specs)
         self._changes: dict[str, deque[tuple[int, dict[str, Any]]]] = defaultdict(deque)
-        """Of each mailbox ticks, and the values of its signals by name."""
+        """By mailbox: ticks, and the values of its signals by name."""
         self._tap = SignalTap(segment, [*signals, *followed])
         self.lost = 0
         self.take()
-        # What was overwritten before anyone asked does not count.
+        # Messages overwritten before the start do not count.
         self.lost = 0
 
     def take(self) -> list[Written]:
-        """Take what was written since the last call, and return it."""
-        found = [*self._tap.take()]
-        for written in found:
+        """Read and return the messages since the last call."""
+        all_written = [*self._tap.take()]
+        for written in all_written:
             self.lost += written.lost
-            own = [signal for signal in self.signals if signal.mailbox == written.mailbox]
-            if own:
-                names = [signal.name for signal in own]
-                values = zip(*(signal.plain(written.messages) for signal in own), strict=True)
-                named = (dict(zip(names, row, strict=True)) for row in values)
+            mailbox_signals = [
+                signal for signal in self.signals if signal.mailbox == written.mailbox
+            ]
+            if mailbox_signals:
+                names = [signal.name for signal in mailbox_signals]
+                values = zip(
+                    *(signal.plain(written.messages) for signal in mailbox_signals), strict=True
+                )
+                named_rows = (dict(zip(names, row, strict=True)) for row in values)
                 changes = self._changes[written.mailbox]
-                changes.extend(zip(written.ticks.tolist(), named, strict=True))
+                changes.extend(zip(written.ticks.tolist(), named_rows, strict=True))
                 while len(changes) > 1 and changes[1][0] < changes[-1][0] - self._span:
                     changes.popleft()
-        return found
+        return all_written
 
     def table(self, first: int, last: int) -> Rows:
-        """Return a row for each tick from `first` to `last` at which one of the signals was
-        released.
-        """
-        changes = [one for many in self._changes.values() for one in many if one[0] <= last]
+        """Return a row for each tick from `first` to `last` at which a signal was released."""
+        changes = [
+            change
+            for mailbox_changes in self._changes.values()
+            for change in mailbox_changes
+            if change[0] <= last
+        ]
         newest: dict[str, Any] = {}
         table: dict[int, list[Any]] = {}
         for tick, values in sorted(changes, key=lambda change: change[0]):
@@ -113,12 +128,12 @@ class Strip:
         return [*table.items()]
 
     def time_s(self, tick: int) -> float:
-        """Return the simulated time of a tick, s."""
+        """Convert a tick to simulated time, s."""
         return round(tick * self.tick_s, 9)
 
 
 def cell(value: Any) -> str:
-    """Return a value as text."""
+    """Format a value of a signal."""
     if isinstance(value, list):
         return " ".join(map(cell, value))
     if value is None:
@@ -127,8 +142,13 @@ def cell(value: Any) -> str:
 
 
 class Lines:
-    """Signals as lines of text, or of JSON documents: one every `every` ticks, or with 0 one for
-    each tick at which a signal was released; the `first` tick begins.
+    """Prints signals as lines of text or JSON.
+
+    Args:
+        strip: The signals.
+        first: Tick of the first line.
+        every: Number of ticks between two lines. 0 for a line at each tick with a release.
+        as_json: True to print JSON documents.
     """
 
     def __init__(self, strip: Strip, first: int, every: int, as_json: bool) -> None:
@@ -138,7 +158,7 @@ class Lines:
         self._as_json = as_json
 
     def show(self, last: int) -> None:
-        """Print what was released until the tick `last`, and is not printed yet."""
+        """Print the lines up to the tick `last` that have not been printed yet."""
         for tick, values in self._strip.table(self._next, last):
             if tick >= self._next:
                 self._print(tick, values)
@@ -155,8 +175,12 @@ class Lines:
 
 
 class Plot:
-    """Signals as curves on the terminal: `span` ticks of them. Raises `ImportError` without
-    plotext.
+    """Draws signals as curves on the terminal. Raises `ImportError` without plotext.
+
+    Args:
+        strip: The signals.
+        span: Number of ticks that the plot covers.
+        terminal: Where it is drawn.
     """
 
     def __init__(self, strip: Strip, span: int, terminal: Console) -> None:
@@ -176,14 +200,15 @@ class Plot:
         self._live.stop()
 
     def show(self, last: int) -> None:
-        """Draw what was released in the time before the tick `last`."""
+        """Draw the curves that end before the tick `last`."""
         from rich.text import Text
 
         rows = self._strip.table(last - self._span, last)
         plot = self._plotext
         plot.clear_figure()
-        plot.theme("clear")  # the terminal's own colours
-        # One line less: else the terminal scrolls.
+        # Use the colours of the terminal.
+        plot.theme("clear")
+        # Leave one line free, because the terminal would scroll otherwise.
         plot.plotsize(self._live.console.width, max(self._live.console.height - 1, 4))
         plot.xlabel("simulated time, s")
         for name, points in self._curves(rows).items():
@@ -192,8 +217,9 @@ class Plot:
         self._live.update(Text.from_ansi(plot.build()), refresh=True)
 
     def _curves(self, rows: Rows) -> dict[str, list[tuple[float, float]]]:
-        """Return points by the name of the curve: a signal with several numbers has one for
-        each.
+        """Return points by the name of the curve.
+
+        A signal with several numbers has a curve for each.
         """
         curves = defaultdict(list)
         for tick, values in rows:
@@ -206,7 +232,7 @@ class Plot:
 def _numbers(name: str, value: Any) -> Iterator[tuple[str, float]]:
     """Yield the numbers of a value, each with its name."""
     if isinstance(value, list):
-        for index, part in enumerate(value):
-            yield from _numbers(f"[{index}] {name}", part)
+        for index, element in enumerate(value):
+            yield from _numbers(f"[{index}] {name}", element)
     elif isinstance(value, int | float):
         yield name, value

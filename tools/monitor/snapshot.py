@@ -1,6 +1,4 @@
-"""A snapshot of a running rack, from the host side: one row a task, what holds the rack, the
-progress of its task.
-"""
+"""Takes snapshots of a running rack: one row for each task, holds, and the progress of its task."""
 
 from __future__ import annotations
 
@@ -37,21 +35,26 @@ from rack.tools.monitor.queues import QueueFill, queue_fills
 LOST = "lost"
 """State of a task that died or does not respond, until its new process has rejoined."""
 DEAD = "dead"
-"""State of a run whose launcher is gone: 'rack clean' removes it."""
-HELD = "HELD: 'rack step {}' lets it go on"
-"""Line of a rack in lockstep that is single-stepped."""
+"""State of a run whose launcher has ended. `rack clean` removes it."""
+HELD = "HELD: 'rack step {}' continues it"
+"""Warning about a rack in lockstep that is held between two ticks."""
 TASK_STATUS = "task_status"
 """Message type of the level that reports the progress of the whole task."""
 
 
 @dataclass(frozen=True)
 class TaskRow:
-    """One task now. Times are the longest of the newest cycles, in ms, or of all: see
-    `RackMonitor`; None before the first.
+    """One task now.
 
-    `priority` is the SCHED_FIFO priority obtained, 0 for ordinary scheduling. `mode` is "operator"
-    while a command of an operator is in force, otherwise "automatic"; empty for tasks that take
-    none. `row` is what fired of a state table.
+    Attributes:
+        priority: SCHED_FIFO priority obtained. 0 for ordinary scheduling.
+        exec_ms: Longest execution time of the cycles that `RackMonitor` covers. None without a
+            cycle.
+        lateness_ms: Longest lateness of these cycles.
+        row: Row of a state table that was executed.
+        mode: "operator" while a command of an operator is in force, otherwise "automatic". Empty
+            for
+            tasks that take no commands.
     """
 
     task: str
@@ -75,7 +78,7 @@ class TaskRow:
 
 @dataclass(frozen=True)
 class TaskProgress:
-    """Progress of the task: elemental moves and actions done, of how many."""
+    """Progress of the task: elemental moves and actions, done and in all."""
 
     moves_done: int
     moves: int
@@ -87,14 +90,22 @@ class TaskProgress:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """A rack now. `time_s` is simulated time; `lines` are the utility lines asserted, and warnings.
+    """A rack now.
 
-    `demand` is the safety demand on the arm, normally "none"; `faults` are the active ones; `holds`
-    are the levels, or the arm, that are kept from their work; `hosts` the boards of the host side,
-    `entries` what passes to and from them; `queues` are all of them, empty ones too; `inboxes`
-    those of boards that messages interrupt; `exchanges` the messages in use of boards with an
-    exchange, by port; `peers` other racks on the network, `imports` and `exports` what passes to
-    and from them.
+    Attributes:
+        time_s: Simulated time.
+        lines: Asserted utility lines, and warnings.
+        demand: Safety demand on the arm, normally "none".
+        faults: Active faults.
+        holds: Levels, or the arm, that are kept from their work.
+        hosts: Boards of the host side.
+        entries: Messages that pass to and from the host boards.
+        queues: All queues, including empty ones.
+        inboxes: Inboxes of the boards that messages interrupt.
+        exchanges: Ages of the messages in use by boards with an exchange, by board and port.
+        peers: Other racks on the network.
+        imports: Messages from them.
+        exports: Messages to them.
     """
 
     rack: str
@@ -119,8 +130,15 @@ class Snapshot:
 
 
 class RackMonitor:
-    """Takes snapshots of one rack; each covers the cycles since the one before, with
-    `keeps_longest` all since the first, or since `forget_times`.
+    """Takes snapshots of one rack.
+
+    Args:
+        segment: The rack.
+        keeps_longest: True for the longest times since the first snapshot, or since `forget_times`.
+            By default each snapshot covers the cycles since the previous one.
+
+    Attributes:
+        cycles: Trace records of each task since the previous snapshot.
     """
 
     def __init__(self, segment: Segment, keeps_longest: bool = False) -> None:
@@ -132,12 +150,11 @@ class RackMonitor:
         self._joints = tuple(robot.get("joints", ()))
         self._traces = {task.name: trace_ring(segment, task.name) for task in segment.layout.tasks}
         self.cycles: dict[str, np.ndarray] = {}
-        """Trace records of each task that the last look took."""
         self._keeps_longest = keeps_longest
         self._longest_ns: dict[str, np.ndarray] = {}
 
     def look(self) -> Snapshot:
-        """Return the rack as it is now."""
+        """Take a snapshot."""
         segment = self._segment
         words = segment.words
         layout = segment.layout
@@ -170,41 +187,43 @@ class RackMonitor:
         )
 
     def _active_faults(self) -> Iterator[str]:
+        """Yield a text for each active fault."""
         for fault in self._faults.staged((Stage.ACTIVE,)):
-            # The kinds of faults take a while to import; most racks have none.
+            # Import late: most racks have no faults, and the import takes a while.
             from rack.boards.faults.describe import describe
             from rack.boards.faults.kind import UNKNOWN, kind_of
 
             if kind_of(fault) is UNKNOWN:
                 from rack.boards.config.published import PublishedRack
 
-                # A kind that the rack's levels add is known once this is read.
+                # Reading this registers the kinds that the levels of the rack add.
                 PublishedRack.of_rack(self._segment)
             yield describe(fault, self._segment.layout, self._joints)
 
     def _asserted(self) -> list[str]:
-        """Return the utility lines asserted, and warnings."""
+        """Return the asserted utility lines, and warnings."""
         lines = self._lines
-        shown = [f"SYSFAIL slot {slot}" for slot in lines.sysfail]
+        warnings = [f"SYSFAIL slot {slot}" for slot in lines.sysfail]
         single = {
             "ACFAIL": lines.acfail,
             "SYSRESET": lines.sysreset,
             "EMERGENCY STOP": lines.emergency_stop,
         }
-        shown += [name for name, asserted in single.items() if asserted]
+        warnings += [name for name, asserted in single.items() if asserted]
         words = self._segment.words
         tasks = [task.name for task in self._segment.layout.tasks if task.priority]
-        blocks = [(name, self._segment.block(name)) for name in tasks]
+        blocks = zip(tasks, map(self._segment.block, tasks), strict=True)
         refused = [name for name, block in blocks if block[Block.PID] and not block[Block.PRIORITY]]
         if refused and words[System.STATE] != Run.STARTING and not words[System.LOCKSTEP]:
-            shown.append(f"NO REAL-TIME PRIORITY: {', '.join(refused)}")
+            warnings.append(f"NO REAL-TIME PRIORITY: {', '.join(refused)}")
         if words[System.HELD]:
-            shown.append(HELD.format(self._segment.rack))
+            warnings.append(HELD.format(self._segment.rack))
         if count := words[System.SNAPSHOTS]:
-            shown.append(f"{count} SNAPSHOTS, {words[System.SNAPSHOT_BYTES] / 1e6:.0f} MB")
-        return shown
+            warnings.append(f"{count} SNAPSHOTS, {words[System.SNAPSHOT_BYTES] / 1e6:.0f} MB")
+        return warnings
 
     def _row(self, task: TaskSpec) -> TaskRow:
+        """Describe a task."""
         block = self._segment.block(task.name)
         exec_ms, lateness_ms = self._times_ms(task.name)
         state = as_named(TaskState, block[Block.STATE]).name.lower()
@@ -212,7 +231,7 @@ class RackMonitor:
         if block[Block.LOST]:
             state = LOST
         elif (status := self._newest.message(f"{task.name}.status")) is not None:
-            # Of a user's level without a state, or with others, it is that of its process.
+            # For a user's level without a known state, show the state of its process.
             state = state_name(getattr(status, "state", None), state)
             reason = reason_of(status)
             row = fired(status)
@@ -239,12 +258,13 @@ class RackMonitor:
         )
 
     def forget_times(self) -> None:
-        """Begin again with the longest times."""
+        """Forget the longest times so far."""
         self._longest_ns.clear()
 
     def _times_ms(self, task: str) -> list[float | None]:
-        """Return the longest execution and lateness of a task; where a look sees no cycle, as
-        before.
+        """Return the longest execution time and lateness of a task.
+
+        Without a new cycle they are those of the previous snapshot.
         """
         self.cycles[task] = cycles = self._traces[task].drain().rows
         longest = self._longest_ns.get(task)
@@ -256,21 +276,25 @@ class RackMonitor:
         return [None, None] if longest is None else (longest * 1e-6).tolist()
 
     def _of_type(self, message: str) -> Iterator[tuple[str, AnyMessage]]:
-        """Yield the newest message in every mailbox of a message type, with its writer."""
+        """Yield the writer and the newest message of every mailbox with a message type."""
         return self._newest.messages(lambda box: box.message == message)
 
     def _progress(self) -> TaskProgress | None:
-        for _, at in self._of_type(TASK_STATUS):
-            state = state_name(at.state)
-            return TaskProgress(at.moves_done, at.moves, at.action, at.actions, state, at.reason)
+        """Return the progress of the task. None if no level reports it."""
+        for _, status in self._of_type(TASK_STATUS):
+            state = state_name(status.state)
+            return TaskProgress(
+                status.moves_done, status.moves, status.action, status.actions, state, status.reason
+            )
         return None
 
 
 def fired(status: AnyMessage) -> str:
-    """Return what fired of a state table in a level's newest cycle, as text; empty for a level
-    without one.
+    """Format the row of a state table that a level executed in its newest cycle.
+
+    Empty for a level without a state table.
     """
     if not {"row", "fired", "in_state", "table"} <= {*(status.record.dtype.names or ())}:
         return ""
-    what = f"row {status.row} '{status.fired}'" if status.row else "no row"
-    return f"{what}, now in '{status.in_state}', table {status.table}"
+    row_text = f"row {status.row} '{status.fired}'" if status.row else "no row"
+    return f"{row_text}, now in '{status.in_state}', table {status.table}"

@@ -1,4 +1,5 @@
-"""Any arm from a model file: read, its parts found, limits and home completed, a folder written.
+"""Brings up an arm from a model file: reads it, drafts a config, finds a task, writes a folder.
 
-No exports: MuJoCo and the planner take a second to import, and only `rack robot` needs them.
+This package exports nothing. MuJoCo and the planner take a second to import, and only `rack robot`
+needs them.
 """

@@ -1,4 +1,7 @@
-"""The arm in a model: its joints from base to tool, and what it carries; all else is held."""
+"""Finds the arm in a model: its joints from base to tool, and what it carries.
+
+All other parts of the model are held in place.
+"""
 
 from __future__ import annotations
 
@@ -19,37 +22,46 @@ from rack.levels.robot.lookup import below, find
 from rack.levels.robot.model import SCALAR_JOINTS, check_number, listed
 
 OF_GRIPPER = re.compile("finger|grip|jaw|claw|knuckle|thumb", re.IGNORECASE)
-"""In the name of a joint: it belongs to a gripper."""
+"""Joints with such names belong to a gripper."""
 LEAST_JOINTS = 4
-"""Joints in a row that make a branch an arm."""
+"""Number of joints in a row that make a branch an arm."""
 MOST_IN_FINGER = 4
-"""Where branches of at most so many joints begin, of about equal length, there is a hand."""
+"""Branches of about equal length with at most this many joints are the fingers of a hand."""
 BASE_JOINTS = 3
-"""Joints before a branch, at least, for that."""
+"""Least number of joints before a branch for it to be a hand."""
 
 
 REFERRING = ("tendon", "equality", "actuator", "contact", "deformable", "sensor", "custom")
 """Sections of an MJCF file that refer to others."""
-KINDS = {"jointinparent": "joint", "node": "body", "subtree": "body", "target": "body"}
-KINDS |= {"xbody": "body", "refsite": "site", "sidesite": "site"}
-KINDS |= {"cranksite": "site", "slidersite": "site"}
-"""To what an attribute refers, where its name, but for a number, is not that of the kind."""
+KINDS = {
+    "jointinparent": "joint",
+    **dict.fromkeys(("node", "subtree", "target", "xbody"), "body"),
+    **dict.fromkeys(("refsite", "sidesite", "cranksite", "slidersite"), "site"),
+}
+"""Kind of element that an attribute refers to, unless its name is the kind, as in `body1`."""
 
 
 @dataclass(frozen=True)
 class ArmParts:
-    """An arm by the names of its parts."""
+    """An arm, given by the names of its parts."""
 
     joints: tuple[str, ...]  # base to tool
     tip: str  # the body at its end, which carries the gripper
-    fingers: tuple[str, ...]  # joints beyond
-    passive: tuple[str, ...]  # joints beyond that nothing drives
+    fingers: tuple[str, ...]  # joints beyond the tip
+    passive: tuple[str, ...]  # joints beyond the tip that nothing drives
     others: tuple[str, ...]  # tips of other arms
 
 
 def find_arm(model: mujoco.MjModel, tip: str, joints: Sequence[str]) -> ArmParts:
-    """Return the arm that ends at the body or site `tip`, or has these `joints`; of neither is
-    told, the longest. Raises `RobotError`.
+    """Find an arm by its tip or its joints. By default it is the longest one in the model.
+
+    Args:
+        model: The compiled model.
+        tip: Body or site at the end of the arm. Empty to choose by joints or by length.
+        joints: Joints of the arm, base to tool. Empty to take all between base and tip.
+
+    Raises:
+        RobotError: A name is unknown, the model has no arm, or nothing drives some of its joints.
     """
     driven = driven_joints(model)
     scalar = np.isin(model.jnt_type, SCALAR_JOINTS)
@@ -70,13 +82,13 @@ def find_arm(model: mujoco.MjModel, tip: str, joints: Sequence[str]) -> ArmParts
         if cut is not None:
             end = int(model.body_parentid[model.jnt_bodyid[cut]])
             chain = chain[: chain.index(cut)]
-        # Where no joint of the chain is driven, --torque states the limits of all.
-        drives = driven & {*chain} or {*chain}
-        # A mobile base stands: passive joints, and slides without an end.
-        while chain and (chain[0] not in drives or _is_endless(model, chain[0])):
+        # If no joint of the chain is driven, --torque states the limits of all of them.
+        driven_in_chain = driven & {*chain} or {*chain}
+        # A mobile base does not move: skip passive joints and slides without limits.
+        while chain and (chain[0] not in driven_in_chain or _is_endless(model, chain[0])):
             chain = chain[1:]
         joints = [_name(model, joint) for joint in chain]
-        if passive := [_name(model, joint) for joint in chain if joint not in drives]:
+        if passive := [_name(model, joint) for joint in chain if joint not in driven_in_chain]:
             raise RobotError(
                 f"nothing drives {listed(passive)}, though other joints of the arm have an actuator"
                 " or an effort; --tip names a body before them, --joints what to drive"
@@ -98,107 +110,118 @@ def find_arm(model: mujoco.MjModel, tip: str, joints: Sequence[str]) -> ArmParts
 
 
 def driven_joints(model: mujoco.MjModel) -> set[int]:
-    """Return the joints for which a model states a drive: an actuator, by itself or through a
-    tendon, the effort of a URDF, or a coupling to other joints.
+    """Return the ids of the joints for which a model states a drive.
+
+    A drive is an actuator, directly or through a tendon, the effort of a URDF, or a coupling to
+    other joints.
     """
     every = np.arange(model.njnt)
     drives = actuator_moments(model, every, model.qpos0[model.jnt_qposadr]).any(axis=0)
-    own = every[drives | model.jnt_actfrclimited]
-    return set(own.tolist()).union(*(tied_joints(model, k) for k in range(model.neq)))
+    driven = every[drives | model.jnt_actfrclimited]
+    return set(driven.tolist()).union(*(tied_joints(model, k) for k in range(model.neq)))
 
 
 def hold(path: Path, kept: Iterable[str]) -> list[str]:
-    """Take out of an MJCF file, as MuJoCo writes it, all joints but those `kept`, bodies that fly
-    or that something outside moves, and what refers to them; return those bodies.
+    """Fix all joints of an MJCF file except some, and remove free bodies.
+
+    Bodies moved from outside (mocap) and everything that refers to a removed element are removed
+    as well.
+
+    Args:
+        path: The file, as MuJoCo writes it. It is overwritten.
+        kept: Names of the joints that stay.
+
+    Returns:
+        Names of the removed bodies.
     """
     tree = ElementTree.parse(path)
     root = tree.getroot()
     moving = {("joint", name) for name in kept}
-    gone = set[tuple[str, str]]()
-    flying = []
+    removed = set[tuple[str, str]]()
+    free_bodies = []
     world = root.find("worldbody")
     assert world is not None, "MuJoCo writes one"
-    parts = [part for part in world.iter() if part.tag in ("worldbody", "body", "frame")]
-    for part in parts:
-        for body in part.findall("body"):
-            own = {(inner.tag, inner.get("name", "")) for inner in body.iter()}
-            flies = (
+    parents = [parent for parent in world.iter() if parent.tag in ("worldbody", "body", "frame")]
+    for parent in parents:
+        for body in parent.findall("body"):
+            names = {(inner.tag, inner.get("name", "")) for inner in body.iter()}
+            is_free = (
                 body.find("freejoint") is not None or body.find("joint[@type='free']") is not None
             )
-            if not own & moving and (flies or "mocap" in body.attrib):
-                part.remove(body)
-                gone |= own
-                flying.append(body.get("name", ""))
-        for joint in [*part.findall("joint"), *part.findall("freejoint")]:
+            if not names & moving and (is_free or "mocap" in body.attrib):
+                parent.remove(body)
+                removed |= names
+                free_bodies.append(body.get("name", ""))
+        for joint in [*parent.findall("joint"), *parent.findall("freejoint")]:
             if ("joint", joint.get("name", "")) not in moving:
-                part.remove(joint)
-                gone.add(("joint", joint.get("name", "")))
+                parent.remove(joint)
+                removed.add(("joint", joint.get("name", "")))
     for keys in root.findall("keyframe"):
         root.remove(keys)
     sections = [section for section in root if section.tag in REFERRING]
-    # What refers to an element that is taken out may be referred to itself.
-    while dropped := [
+    # Repeat, because other elements may refer to those just removed.
+    while referring := [
         (section, element)
-        for section in parts + sections
+        for section in parents + sections
         for element in section
-        if (section in sections or element.tag in ("camera", "light")) and _refers(element, gone)
+        if (section in sections or element.tag in ("camera", "light")) and _refers(element, removed)
     ]:
-        for section, element in dropped:
+        for section, element in referring:
             section.remove(element)
-            is_mixed = section in parts or section.tag in ("custom", "deformable")
-            gone.add((element.tag if is_mixed else section.tag, element.get("name", "")))
+            is_mixed = section in parents or section.tag in ("custom", "deformable")
+            removed.add((element.tag if is_mixed else section.tag, element.get("name", "")))
     tree.write(path)
-    return flying
+    return free_bodies
 
 
-def _refers(element: ElementTree.Element, gone: set[tuple[str, str]]) -> bool:
-    """Return whether an element, or one in it, refers to one that is gone."""
+def _refers(element: ElementTree.Element, removed: set[tuple[str, str]]) -> bool:
+    """Return whether an element, or one inside it, refers to a removed element."""
     for inner in element.iter():
         for key, value in inner.items():
             is_typed = key in ("objname", "refname")
             kind = (inner.get(f"{key[:3]}type", "") if is_typed else key).rstrip("12")
             names = value.split() if inner.tag == "flex" else [value]
-            if any((KINDS.get(kind, kind), name) in gone for name in names):
+            if any((KINDS.get(kind, kind), name) in removed for name in names):
                 return True
     return False
 
 
 def _longest(model: mujoco.MjModel, scalar: Mask, driven: set[int]) -> tuple[int, list[int]]:
-    """Find the longest arm: the way with the most joints that ends at a driven one, if any is.
+    """Find the longest arm: the chain with the most joints, ending at a driven one if possible.
 
     Args:
         model: The compiled model.
         scalar: (joints,), True for hinges and slides.
-        driven: Joints with a drive.
+        driven: Ids of the joints with a drive.
 
     Returns:
-        The body at its end, and the bodies where other arms begin.
+        The body at its end, and the bodies at which other arms begin.
     """
-    own = np.bincount(model.jnt_bodyid[scalar], minlength=model.nbody)
-    depth = own.copy()
-    leads = np.full(model.nbody, not driven)
-    leads[model.jnt_bodyid[[*driven]]] = True
+    joint_count = np.bincount(model.jnt_bodyid[scalar], minlength=model.nbody)
+    depth = joint_count.copy()
+    is_driven = np.full(model.nbody, not driven)
+    is_driven[model.jnt_bodyid[[*driven]]] = True
     for body in range(model.nbody - 1, 0, -1):
         parent = model.body_parentid[body]
-        leads[parent] |= leads[body]
-        depth[body] *= leads[body]
-        depth[parent] = max(depth[parent], own[parent] + depth[body])
+        is_driven[parent] |= is_driven[body]
+        depth[body] *= is_driven[body]
+        depth[parent] = max(depth[parent], joint_count[parent] + depth[body])
     body = 0
-    passed = 0
+    passed_joints = 0
     others: list[int] = []
     while True:
-        passed += own[body]
+        passed_joints += joint_count[body]
         children = np.flatnonzero(model.body_parentid == body)
-        ways = [int(k) for k in children if k and depth[k]]
-        ways.sort(key=lambda k: -depth[k])
-        if not ways:
+        branches = [int(k) for k in children if k and depth[k]]
+        branches.sort(key=lambda k: -depth[k])
+        if not branches:
             return body, others
-        longest = depth[ways[0]]
-        is_even = len(ways) > 1 and depth[ways[1]] >= longest - 1
-        if is_even and passed >= BASE_JOINTS and longest <= MOST_IN_FINGER:
+        longest = depth[branches[0]]
+        is_even = len(branches) > 1 and depth[branches[1]] >= longest - 1
+        if is_even and passed_joints >= BASE_JOINTS and longest <= MOST_IN_FINGER:
             return body, others
-        others += [k for k in ways[1:] if depth[k] >= LEAST_JOINTS]
-        body = ways[0]
+        others += [k for k in branches[1:] if depth[k] >= LEAST_JOINTS]
+        body = branches[0]
 
 
 def _is_endless(model: mujoco.MjModel, joint: int) -> bool:

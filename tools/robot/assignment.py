@@ -1,5 +1,6 @@
-"""Something to do for a drafted arm: a table with two blocks that it moves, or a tour of poses;
-either is rehearsed as the task level will.
+"""Finds a task for a drafted arm: a table with two blocks to move, or a tour of poses.
+
+Either is rehearsed in the way in which the task level will plan it.
 """
 
 from __future__ import annotations
@@ -29,40 +30,47 @@ from rack.levels.task.grasps import FULL_ORIENTATION, QUARTERS
 from rack.levels.task.program import DOWN, TaskConfig
 from rack.levels.task.rehearsal import Rehearsal
 from rack.tools.console.answer import Document
-from rack.tools.robot.draft import LEAST_PART, NOTHING, Draft, poses
-from rack.tools.robot.fingertips import Fingertips
+from rack.tools.robot.draft import LEAST_PART, NOTHING, Draft, FittedGripper, find_home, poses
 
 SEED = 1990
-"""That of `nasrem`."""
+"""Seed of `nasrem`."""
 HEIGHTS = (0.05, 0.2, -0.1, 0.4, 0.6)
 DISTANCES = (0.55, 0.7, 0.42, 0.34)
 FRONTS = (0.0, 0.5 * np.pi, -0.5 * np.pi, np.pi)
-"""Tables that are tried: height over the base and distance of the middle in parts of the reach;
-direction, rad."""
+"""Tables that are tried: height over the base, distance of the centre, and direction in rad.
+
+Heights and distances are fractions of the reach."""
 SPOTS = ((-0.04, -0.1), (0.04, -0.26), (-0.04, 0.1), (0.04, 0.26))
-"""Where the blocks stand, and where they go: outward and sideways from the middle, likewise."""
+"""Starts and ends of the blocks: outward and sideways from the centre, as fractions of the reach.
+"""
 TABLES = 4
-"""Tables on which the whole task is rehearsed, at most."""
+"""Maximum number of tables on which the whole task is rehearsed."""
 SEARCH_S = 15.0
-"""Processor time in which a table is sought, about: then a tour has to do."""
+"""Processor time for the search for a table, roughly. After that the arm gets a tour."""
 REHEARSAL_S = 10.0
-"""Processor time for the task on one table; those that served took at most 1.6 s. Where there is no
-way between the blocks, all others are tried at 2 s each."""
+"""Processor time for the task on one table.
+
+Successful rehearsals took at most 1.6 s. Without a path between the blocks, each attempt to find
+one takes 2 s.
+"""
 STOPS = 4
-"""Poses of a tour."""
+"""Number of poses in a tour."""
 OBJECTS = ("block1", "block2")
 TABLE = "table"
-"""Names; a model that has them gets others."""
+"""Names of table and blocks. Others are used if the model has these already."""
 MOST_BLOCK_M = 0.05
 DENSITY = 400.0  # kg/m3
 CLEAR_M = 0.008
-"""Between fingers and table when a block is taken."""
+"""Clearance between fingers and table when a block is taken."""
 LOOSE_M = 0.004
-"""More, where it is a guess how fingers follow: with less Robotiq's 140 touches the table."""
+"""Additional clearance where it is a guess how the fingers follow.
+
+With less, Robotiq's 140 touches the table.
+"""
 
 
 class TableSpot(NamedTuple):
-    """A table that may do."""
+    """A place for a table, with two starts and two ends for blocks."""
 
     top: float  # m
     front: float  # rad
@@ -72,41 +80,54 @@ class TableSpot(NamedTuple):
 
 @dataclass(frozen=True)
 class Assignment:
-    """A scene and a program for it."""
+    """A scene and a program for it.
+
+    Attributes:
+        scene: Objects and supports.
+        actions: The program, as tables of a config.
+        kind: Description of the program for the user.
+    """
 
     scene: SceneConfig
     actions: list[Document]
     kind: str
 
 
-def lay_out(made: Draft) -> Assignment:
-    """Return what the arm can do, its home fit for that; the model gets table and blocks. Raises
-    `RobotError`.
+def lay_out(draft: Draft) -> Assignment:
+    """Find a task for an arm. Raises `RobotError` if it cannot even tour poses.
+
+    The draft's home is changed to suit the task, and its model gets table and blocks.
     """
-    if made.jaws is not None:
-        found = _pick_and_place(made, made.jaws)
-        if isinstance(found, Assignment):
-            return found
-        made.notes.append(f"no transfer, but a tour of poses: {found}")
-    return _tour(made)
+    if draft.gripper is not None:
+        result = _pick_and_place(draft, draft.gripper)
+        if isinstance(result, Assignment):
+            return result
+        draft.notes.append(f"no transfer, but a tour of poses: {result}")
+    return _tour(draft)
 
 
-def _pick_and_place(made: Draft, jaws: Fingertips) -> Assignment | str:
-    cell = made.cell()
-    width = min(jaws.block, MOST_BLOCK_M)
-    # The tool is in the middle of a block that stands, its fingers clear of the table.
-    clear = CLEAR_M + LOOSE_M * bool(made.table["gripper"].follow)
-    half = 0.5 * np.array([width, width, max(width, 2.0 * (jaws.below + clear))])
+def _pick_and_place(draft: Draft, gripper: FittedGripper) -> Assignment | str:
+    """Find a table on which the arm can move two blocks, or return why there is none."""
+    cell = draft.cell()
+    fingertips = gripper.fingertips
+    width = min(fingertips.block, MOST_BLOCK_M)
+    # The tool goes to the centre of a standing block, so the block keeps the fingers off the table.
+    clear = CLEAR_M + LOOSE_M * bool(gripper.config.follow)
+    half = 0.5 * np.array([width, width, max(width, 2.0 * (fingertips.below + clear))])
     reach = _reach(cell)
     lift = round(min(0.1, 0.12 * reach), 3)
-    why = "no table on which the tool comes down to blocks"
+    reason = "no table on which the tool comes down to blocks"
     spots = (spot for spot in _spots(cell, reach) if _serves(cell, spot, half[2], lift))
-    taken = {body.name for body in made.spec.bodies} | {geom.name for geom in made.spec.geoms}
-    table, *blocks = (f"{name} of rack" if name in taken else name for name in (TABLE, *OBJECTS))
+    used_names = {body.name for body in draft.spec.bodies} | {
+        geom.name for geom in draft.spec.geoms
+    }
+    table, *blocks = (
+        f"{name} of rack" if name in used_names else name for name in (TABLE, *OBJECTS)
+    )
     scene = SceneConfig(objects=tuple(blocks), supports=(table,))
     for spot in itertools.islice(spots, TABLES):
-        added = _furnish(made.spec, scene, spot, half, reach)
-        made.write_model()
+        added = _furnish(draft.spec, scene, spot, half, reach)
+        draft.write_model()
         height = round(spot.top + half[2], 4)
         actions: list[Document] = [
             {
@@ -119,27 +140,29 @@ def _pick_and_place(made: Draft, jaws: Fingertips) -> Assignment | str:
         ]
         actions.append({"do": "home"})
         try:
-            made.search_home(scene, [np.array(action["to"]) for action in actions[:-1]])
-            _rehearse(made, scene, actions)
+            draft.home = find_home(
+                draft, scene, [np.array(action["to"]) for action in actions[:-1]]
+            )
+            _rehearse(draft, scene, actions)
             return Assignment(scene, actions, "a table, two blocks to move")
         except (Refused, RobotError) as refused:
-            why = str(refused)
+            reason = str(refused)
         for body in added:
-            made.spec.delete(body)
-        made.write_model()
-    made.search_home()
-    return why
+            draft.spec.delete(body)
+        draft.write_model()
+    draft.home = find_home(draft)
+    return reason
 
 
 def _reach(cell: Cell) -> float:
-    """Return the largest distance of the tool from the base, m."""
+    """Estimate the largest distance of the tool from the base, m."""
     ik = InverseKinematics(cell, SEED)
     base = _base(cell)
     return max(norm(ik.tool_at(q).position - base) for q in poses(cell))
 
 
 def _base(cell: Cell) -> Array:
-    """Return where the arm stands, (3,), m: below its first joint, at its root's height."""
+    """Return the base of the arm, (3,), m: below its first joint, at the height of its root."""
     data = cell.start()
     joint = cell.model.dof_jntid[cell.dof[0]]
     root = cell.model.body_rootid[cell.model.jnt_bodyid[joint]]
@@ -147,6 +170,7 @@ def _base(cell: Cell) -> Array:
 
 
 def _spots(cell: Cell, reach: float) -> Iterator[TableSpot]:
+    """Yield places for a table until `SEARCH_S` is over."""
     base = _base(cell)
     end = time.process_time() + SEARCH_S
     for height, distance, front in itertools.product(HEIGHTS, DISTANCES, FRONTS):
@@ -160,17 +184,17 @@ def _spots(cell: Cell, reach: float) -> Iterator[TableSpot]:
 
 
 def _serves(cell: Cell, spot: TableSpot, half: float, lift: float) -> bool:
-    """Say whether the tool comes down to every place."""
+    """Return whether the tool can come down to every place from above."""
     ik = InverseKinematics(cell, SEED)
-    # Of fewer joints one has to be chosen less luckily.
+    # An arm with fewer joints has fewer solutions, so search longer for one.
     restarts = MAX_RESTARTS if len(cell.qpos) >= FULL_ORIENTATION else LEANING_RESTARTS
 
     def is_reached(place: Array) -> bool:
         for quarter in QUARTERS:
-            turned = pointing(DOWN, -(spot.front + 0.5 * np.pi * quarter))
-            low = pose([*place, spot.top + half], turned)
-            above = ik.reachable(low.raised(lift), cell.home, restarts=restarts)
-            if any(ik.nearby(low, q) is not None for q in above):
+            orientation = pointing(DOWN, -(spot.front + 0.5 * np.pi * quarter))
+            placed = pose([*place, spot.top + half], orientation)
+            raised = ik.reachable(placed.raised(lift), cell.home, restarts=restarts)
+            if any(ik.nearby(placed, q) is not None for q in raised):
                 return True
         return False
 
@@ -180,25 +204,38 @@ def _serves(cell: Cell, spot: TableSpot, half: float, lift: float) -> bool:
 def _furnish(
     spec: mujoco.MjSpec, scene: SceneConfig, spot: TableSpot, half: Array, reach: float
 ) -> list[mujoco.MjsBody]:
-    """Add table and blocks to a model; return their bodies."""
-    turned = [np.cos(0.5 * spot.front), 0.0, 0.0, np.sin(0.5 * spot.front)]
+    """Add table and blocks to a model.
+
+    Args:
+        spec: The model, which is changed.
+        scene: Names of table and blocks.
+        spot: Place of the table.
+        half: Half of the size of a block, (3,), m.
+        reach: Reach of the arm, m, by which the table is sized.
+
+    Returns:
+        The added bodies.
+    """
+    quaternion = [np.cos(0.5 * spot.front), 0.0, 0.0, np.sin(0.5 * spot.front)]
     (name,) = scene.supports
-    table = spec.worldbody.add_body(name=name, pos=[*spot.middle, spot.top - 0.02], quat=turned)
+    table = spec.worldbody.add_body(name=name, pos=[*spot.middle, spot.top - 0.02], quat=quaternion)
     box = mujoco.mjtGeom.mjGEOM_BOX
     sizes = [0.15 * reach, 0.4 * reach, 0.02]
     table.add_geom(name=name, type=box, size=sizes, rgba=[0.6, 0.5, 0.4, 1.0])
     added = [table]
     colours = ([0.2, 0.4, 0.8, 1.0], [0.2, 0.7, 0.3, 1.0])
     for name, place, colour in zip(scene.objects, spot.places, colours, strict=False):
-        at = [*place, spot.top + half[2]]
-        block = spec.worldbody.add_body(name=name, pos=at, quat=turned)
+        position = [*place, spot.top + half[2]]
+        block = spec.worldbody.add_body(name=name, pos=position, quat=quaternion)
         block.add_freejoint(name=name)
         geom = block.add_geom(name=name, type=box, size=half, rgba=colour)
         geom.mass = DENSITY * float(np.prod(2.0 * half))
-        geom.group = spec.compiler.inertiagrouprange[0]  # of others no inertia is inferred
+        # MuJoCo infers inertia only from geoms of certain groups.
+        geom.group = spec.compiler.inertiagrouprange[0]
         geom.condim = 4
         geom.friction[:] = [1.0, 0.02, 0.001]
-        # As stiff with any finger: the mean with MuJoCo's 20 ms lets what is carried drift.
+        # Impose this stiffness on every contact: averaged with MuJoCo's default of 20 ms, a carried
+        # block would drift.
         geom.priority = 1
         geom.solref[:] = [0.002, 1.0]
         geom.solimp[:3] = [0.95, 0.99, 0.001]
@@ -206,48 +243,49 @@ def _furnish(
     bits = 1
     for geom in spec.geoms:
         bits |= geom.contype | geom.conaffinity
-    # The model's own defaults may say otherwise; blocks touch pads that touch nothing else, too.
-    for body, own in zip(added, (1, bits, bits), strict=True):
-        body.geoms[0].contype = body.geoms[0].conaffinity = own
+    # Override the model's defaults. Blocks also touch pads that touch nothing else.
+    for body, contact_bits in zip(added, (1, bits, bits), strict=True):
+        body.geoms[0].contype = body.geoms[0].conaffinity = contact_bits
     return added
 
 
 class _Hurried(MotionPlanner):
-    """Finds no more paths after `REHEARSAL_S`."""
+    """A motion planner that refuses to plan after `REHEARSAL_S`."""
 
     def __init__(self, cell: Cell, scene: SceneConfig, seed: int) -> None:
         super().__init__(cell, scene, seed)
         self._end = time.process_time() + REHEARSAL_S
 
     def plan(self, *args: Any, **wishes: Any) -> Path:
-        """Plan as the task level does. Raises `Refused`, too, when it is late."""
+        """Plan as the task level does. Also raises `Refused` when the time is over."""
         if time.process_time() > self._end:
             raise Refused(Error.NO_PATH, f"no way found in {REHEARSAL_S:g} s of processor time")
         return super().plan(*args, **wishes)
 
 
-def _rehearse(made: Draft, scene: SceneConfig, actions: list[Document]) -> Rehearsal:
-    """Plan a whole program. Raises `Refused`, or `RobotError` for a start in contact."""
-    cell = made.cell(scene)
-    check_start(cell, made.robot, "home", cell.home)
+def _rehearse(draft: Draft, scene: SceneConfig, actions: list[Document]) -> Rehearsal:
+    """Plan a whole program. Raises `Refused`, or `RobotError` if the start is in contact."""
+    cell = draft.cell(scene)
+    check_start(cell, draft.robot, "home", cell.home)
     data = cell.start()
     situation = Situation(data.xpos[cell.bodies].copy(), data.xquat[cell.bodies].copy())
     start = Rehearsal(_Hurried(cell, scene, SEED), cell.home, situation)
     return rehearse(TaskConfig.model_validate({"action": actions}), scene, start)
 
 
-def _tour(made: Draft) -> Assignment:
-    cell = made.cell()
-    check_start(cell, made.robot, "home", cell.home)
+def _tour(draft: Draft) -> Assignment:
+    """Find poses that can be reached one after the other. Raises `RobotError` if none can."""
+    cell = draft.cell()
+    check_start(cell, draft.robot, "home", cell.home)
     planner = MotionPlanner(cell, NOTHING, SEED)
     statics = Statics(cell)
     actions: list[Document] = []
     for q in poses(cell):
-        wanted = {"do": "goto", "joints": q.round(3).tolist()}
+        action = {"do": "goto", "joints": q.round(3).tolist()}
         try:
             if planner.checker.free(q) and statics.held(q)[0].min() > LEAST_PART:
-                _rehearse(made, NOTHING, [*actions, wanted])
-                actions.append(wanted)
+                _rehearse(draft, NOTHING, [*actions, action])
+                actions.append(action)
         except Refused:
             continue
         if len(actions) == STOPS:

@@ -1,14 +1,16 @@
-"""From a model to a `[robot]` table: what the model states is taken, the rest found or guessed, and
-each guess named.
+"""Drafts a `[robot]` table from a model file, and names every value that is a guess.
+
+`_run_steps` runs the steps. Each returns one record: limits, gripper, tool, overlaps, home.
+`Draft.table` composes them.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -31,7 +33,7 @@ from rack.levels.robot.engine import set_margins
 from rack.levels.robot.linkage import check_couplings
 from rack.levels.robot.model import compile_spec, listed, load_spec, stated_torque
 from rack.levels.servo.control import LoopGains
-from rack.levels.tables import RobotConfig, SceneConfig
+from rack.levels.tables import GripperConfig, RobotConfig, SceneConfig, ToolConfig
 from rack.tools.robot.arm import ArmParts, driven_joints, find_arm, hold
 from rack.tools.robot.fingertips import Fingertips, find_fingertips, tool_outward
 from rack.tools.robot.gripper import fit_fingers
@@ -39,37 +41,41 @@ from rack.tools.robot.pieces import cut_meshes
 from rack.tools.robot.source import Source, copy_model
 
 CLOCK_NS = 2_500_000
-"""Of `nasrem`, whose levels and boards the arm gets."""
+"""Clock period of `nasrem`, whose levels and boards the arm gets."""
 SPEED = {mujoco.mjtJoint.mjJNT_HINGE: 1.5, mujoco.mjtJoint.mjJNT_SLIDE: 0.25}
-"""Guesses, rad/s and m/s."""
+"""Guessed velocity limits by joint type, rad/s and m/s."""
 SPEED_UP_S = 0.5
-"""Time to full speed of planned motion, where the motors can; jerk follows, ten times in a
-second."""
+"""Time to full speed of planned motion, if the motors permit.
+
+The jerk limit is ten times the acceleration limit.
+"""
 LEAST_PART = 0.2
-"""Part of each torque that gravity must leave at home."""
+"""Fraction of each torque limit that must be left over at home after gravity."""
 ROOM = 2.0
-"""A guessed torque in the weights and inertia that it moves."""
+"""Guessed torque limits, as a multiple of the torque for weight, friction and acceleration."""
 DRAG_PART = 0.4
-"""Of the torque that gravity leaves, for friction at a guessed velocity."""
+"""Fraction of the torque left over by gravity that friction may take at a guessed velocity."""
 REST_RAD = 0.002
-"""Where dry friction may hold a joint at rest, from where it should be; tasks permit 0.003."""
+"""Largest error at which dry friction may hold a joint at rest. Tasks permit 0.003 rad."""
 MOST_BANDWIDTH = 100.0
-"""Of the joint loop, rad/s."""
+"""Upper bound for the bandwidth of the joint loop, rad/s."""
 POSES = 400
+"""Number of poses that are sampled."""
 SKIN_M = 1e-4
-"""What is closer counts as in contact: planning would find no way there."""
+"""Bodies closer than this, m, count as touching, because the planner would reject such a pose."""
 APART_M = 0.005
-"""Home is rather where nothing is closer: a linkage settles a little off its equalities."""
+"""Preferred clearance at home, m, because a linkage settles slightly off its equalities."""
 ALWAYS = 0.95
-"""Bodies in contact in so many poses are neighbours, whose shapes overlap."""
+"""Bodies in contact in this fraction of the poses are neighbours whose shapes overlap."""
 TOOLS = ("tcp", "tool", "grip_site", "attachment", "eef", "ee_", "pinch", "hand", "flange")
-"""Parts of the names of frames at the end of an arm, the best first."""
+"""Name parts of frames at the end of an arm, in order of preference."""
 NOTHING = SceneConfig()
+"""A scene without objects or supports."""
 
 
 @dataclass(frozen=True)
 class Wishes:
-    """What the user says of an arm; empty: find it."""
+    """Options of the user. An empty one leaves the choice to the draft."""
 
     tip: str = ""
     joints: tuple[str, ...] = ()
@@ -79,24 +85,98 @@ class Wishes:
     torque: tuple[float, ...] = ()
 
 
+class FittedGripper(NamedTuple):
+    """A gripper that can be used, and what its fingers can take."""
+
+    config: GripperConfig
+    fingertips: Fingertips
+    guess: str
+    notes: list[str]
+
+
+class ToolFrame(NamedTuple):
+    """Frame of the tool: a body or site of the model, and a pose relative to it."""
+
+    name: str
+    offset: ToolConfig | None = None
+    guess: str = ""
+
+
+class HomePose(NamedTuple):
+    """Position to which tasks return."""
+
+    position: list[float]  # (joints,), rad
+    guess: str = ""
+
+
+@dataclass(frozen=True)
+class JointLimits:
+    """Limits of the joints, base to tool. All lists have one value per joint."""
+
+    velocity: list[float]  # rad/s
+    acceleration: list[float]  # rad/s2
+    jerk: list[float]  # rad/s3
+    torque: list[float]  # N m
+    unstated: list[str]  # joints whose velocity the model does not state
+    is_torque_stated: list[bool]
+    bandwidth: float | None = None  # of the joint loop, rad/s; None for the default of `nasrem`
+    friction_error: float = 0.0  # rad: rest error from dry friction with the default bandwidth
+
+
 @dataclass
 class Draft:
-    """An arm as far as it is known."""
+    """A drafted arm: one record for each step of `_run_steps`, composed to a table by `table`."""
 
-    model: Path  # of its own
-    spec: mujoco.MjSpec  # the same, or what it is to be
-    wanted: Wishes
+    model: Path  # MJCF file of the draft
+    spec: mujoco.MjSpec  # content of that file, possibly with changes not yet written
+    wishes: Wishes
     arm: ArmParts
-    starts: Mapping[str, Array]  # positions of the arm's joints, by the names of keyframes
-    guessed: dict[str, str] = field(default_factory=dict)  # by key, what was guessed
-    notes: list[str] = field(default_factory=list)
-    table: dict[str, Any] = field(default_factory=dict)
-    jaws: Fingertips | None = None  # None: nothing can be taken
-    bandwidth: float | None = None  # of the joint loop, rad/s; None: that of `nasrem`
+    keyframes: Mapping[str, Array]  # positions of the arm's joints, (joints,), by name
+    notes: list[str]
+    limits: JointLimits
+    tool: ToolFrame
+    home: HomePose
+    gripper: FittedGripper | None = None
+    exclude: tuple[tuple[str, str], ...] = ()
+
+    @property
+    def table(self) -> dict[str, Any]:
+        """The `[robot]` table, composed of the records found so far."""
+        table = {
+            "model": self.model,
+            "joints": self.arm.joints,
+            "tool": self.tool.name,
+            "home": self.home.position,
+            "velocity": self.limits.velocity,
+            "acceleration": self.limits.acceleration,
+            "jerk": self.limits.jerk,
+            "torque": self.limits.torque,
+            "gripper": self.gripper and self.gripper.config,
+            "tool_offset": self.tool.offset,
+            "exclude": self.exclude,
+        }
+        return {key: value for key, value in table.items() if value}
+
+    @property
+    def guessed(self) -> dict[str, str]:
+        """Keys of the table whose values are guesses, each with its reason."""
+        limits = self.limits
+        torque = f"{ROOM:g} times what weight, friction and inertia take"
+        reasons = {
+            "velocity": limits.unstated and f"the model states none for {listed(limits.unstated)}",
+            "gripper": self.gripper and self.gripper.guess,
+            "tool": self.tool.guess,
+            "exclude": self.exclude and "these bodies overlap in every pose",
+            "torque": not all(limits.is_torque_stated) and torque,
+            "acceleration": "by the torques",
+            "jerk": "by the torques",
+            "home": self.home.guess,
+        }
+        return {key: str(reason) for key, reason in reasons.items() if reason}
 
     @property
     def robot(self) -> RobotConfig:
-        """The table as it is now. Raises `RobotError`."""
+        """The table, validated. Raises `RobotError`."""
         try:
             return RobotConfig(**self.table, guessed=tuple(self.guessed))
         except ValidationError as error:
@@ -104,186 +184,196 @@ class Draft:
             key = ".".join(map(str, first["loc"]))
             raise RobotError(f"robot.{key} = {first['input']}: {first['msg'].lower()}") from None
 
-    def cell(self, scene: SceneConfig = NOTHING) -> Cell:
-        """Return the cell as it is now. Raises `RobotError`."""
-        return unchecked_cell(self.robot, scene, CLOCK_NS)
+    def cell(self, scene: SceneConfig = NOTHING, **changes: Any) -> Cell:
+        """Build the cell of the arm as drafted so far, with changed keys of the table if given.
+
+        Raises `RobotError`.
+        """
+        return unchecked_cell(self.robot.model_copy(update=changes), scene, CLOCK_NS)
 
     def write_model(self) -> None:
-        """Write the model. Raises `RobotError`."""
+        """Write the model to its file. Raises `RobotError`."""
         compile_spec(self.spec, self.model)
         self.model.write_text(self.spec.to_xml(), encoding="utf-8")
 
-    def hold(self, joints: Sequence[str]) -> list[str]:
-        """Hold all joints but these; return the bodies that are left out, since they fly."""
-        left = hold(self.model, joints)
-        self.spec = load_spec(self.model)
-        return left
-
-    def search_home(self, scene: SceneConfig = NOTHING, ends: Sequence[Array] = ()) -> None:
-        """Set home to a pose in which the arm carries itself, free before and after the objects of
-        the scene are at their `ends`, m. Raises `RobotError`.
-        """
-        cell = self.cell(scene)
-        data = cell.start()
-        checkers = [CollisionChecker(cell, scene)]
-        if ends:
-            checkers.append(CollisionChecker(cell, scene))
-            checkers[1].place(np.array(ends), data.xquat[cell.bodies])
-        self.table["home"], guess = _home(cell, checkers, self.starts, self.wanted.home)
-        self.guessed.pop("home", None)
-        if guess:
-            self.guessed["home"] = guess
-
 
 def draft(source: Source, wanted: Wishes, folder: Path, name: str) -> Draft:
-    """Return the arm of a model, as `rack run` takes it: a gripper that it would refuse is held.
-    Raises `RobotError`, one line.
+    """Draft the arm of a model such that `rack run` accepts it.
+
+    A gripper that `rack run` would refuse is fixed in place instead of driven.
+
+    Args:
+        source: The user's model.
+        wanted: Options that the user stated.
+        folder: Folder to which the draft's own model is written.
+        name: Name of that model file, without suffix.
+
+    Raises:
+        RobotError: Nothing can be made of the model. The message is one line.
     """
     try:
-        made = _draft(source, wanted, folder, name)
+        result = _draft(source, wanted, folder, name)
     except RobotError as error:
         raise RobotError("; ".join([str(error), *source.notes])) from None
     try:
-        build_cell(made.robot, NOTHING, CLOCK_NS)
+        build_cell(result.robot, NOTHING, CLOCK_NS)
     except RobotError as error:
-        if made.jaws is None:
+        if result.gripper is None:
             raise
-        made = _draft(source, replace(wanted, gripper="none"), folder, name)
-        made.notes.append(f"no gripper: {error}")
-    return made
+        result = _draft(source, replace(wanted, gripper="none"), folder, name)
+        result.notes.append(f"no gripper: {error}")
+    return result
 
 
-def _draft(source: Source, wanted: Wishes, folder: Path, name: str) -> Draft:
+def _draft(source: Source, wishes: Wishes, folder: Path, name: str) -> Draft:
+    """Run the steps of a draft. Each returns a record that is computed from the draft so far."""
     model = source.compiled()
-    arm = find_arm(model, wanted.tip, wanted.joints)
-    # Equalities with joints that are held are gone afterwards.
+    arm = find_arm(model, wishes.tip, wishes.joints)
+    # Equalities with joints that are fixed disappear with them, so check the couplings first.
     check_couplings(model, arm.joints, of_bodies=False)
     addresses = [model.joint(joint).qposadr[0] for joint in arm.joints]
-    starts = {
+    keyframes = {
         model.key(k).name or f"key {k}": model.key_qpos[k][addresses] for k in range(model.nkey)
     }
-    fingers = () if wanted.gripper == "none" else arm.fingers
+    fingers = () if wishes.gripper == "none" else arm.fingers
     path = folder / f"{name}.xml"
-    made = Draft(path, source.spec, wanted, arm, starts, notes=list(source.notes))
     copy_model(source, path)
     springs = [joint for joint in arm.passive if model.joint(joint).stiffness > 0.0]
-    if left := made.hold((*arm.joints, *fingers, *springs)):
-        made.notes.append(f"left out, as nothing holds it: {listed(left)}")
-    if endless := [joint for joint in arm.joints if not model.joint(joint).limited]:
-        made.notes.append(f"without limits: {listed(endless)}; [robot] position can state them")
-    if arm.passive:
-        why = "nothing drives them: --joints would; those without a spring are held"
-        made.notes.append(f"passive, beyond the arm: {listed([*arm.passive])}; {why}")
-    if arm.others:
-        others = listed(list(arm.others))
-        made.notes.append(f"held: what begins at {others}; --tip chooses another arm")
-    spec = made.spec
-    kinds = [spec.joint(joint).type for joint in arm.joints]
-    known = source.velocity
-    velocity = [known.get(j, SPEED[kind]) for j, kind in zip(arm.joints, kinds, strict=True)]
-    missing = [joint for joint in arm.joints if joint not in known]
-    if missing:
-        made.guessed["velocity"] = f"the model states none for {listed(missing)}"
-    stated = [stated_torque(spec, joint, spec.actuators) for joint in arm.joints]
-    ids = {model.joint(joint).id for joint in arm.joints}
-    if not (wanted.torque or driven_joints(model) & ids):
-        why = "no actuator and no effort"
-        raise RobotError(f"{why} at {listed(list(arm.joints))}; --torque T,... states the limits")
-    made.table = {
-        "model": path,
-        "joints": arm.joints,
-        "tool": _mount(compile_spec(spec, path), arm.tip, wanted.tool),
-        "home": [0.0] * len(arm.joints),
-        "velocity": velocity,
-        "acceleration": velocity,
-        "jerk": velocity,
-        "torque": list(wanted.torque or (limit or 1e6 for limit in stated)),
-    }
+    left_out = hold(path, (*arm.joints, *fingers, *springs))
+    notes = [*source.notes, *_describe_rest(model, arm, left_out)]
+    spec = load_spec(path)
+    limits = _read_limits(source, model, spec, arm.joints, wishes.torque)
+    tool = ToolFrame(wishes.tool or _find_mount(compile_spec(spec, path), arm.tip))
+    home = HomePose([0.0] * len(arm.joints))
+    result = Draft(path, spec, wishes, arm, keyframes, notes, limits, tool, home)
     if fingers:
-        _add_gripper(made)
-    _exclude(made)
-    if not wanted.tool and made.jaws is None:
-        tool, offset = tool_outward(made.cell(), made.table["tool"])
-        made.table |= {"tool": tool, "tool_offset": offset}
-        made.guessed["tool"] = "z along the last joint, outward"
-    unknown = [not limit for limit in wanted.torque or stated]
-    _dimension(made, unknown, [joint in missing for joint in arm.joints])
-    made.search_home()
-    return made
+        try:
+            result.gripper = _fit_gripper(result)
+            notes += result.gripper.notes
+        except RobotError as error:
+            notes.append(f"no gripper: {error}")
+            result.write_model()
+            hold(path, arm.joints)
+            result.spec = load_spec(path)
+    if not wishes.tool:
+        result.tool = _choose_tool(result)
+    result.exclude = _find_overlaps(result.cell())
+    result.limits = limits = _compute_limits(result)
+    if limits.bandwidth is not None:
+        notes.append(
+            f"the joint loop has {limits.bandwidth:g} rad/s: with {LoopGains().bandwidth:g} dry"
+            f" friction may hold a joint {1e3 * limits.friction_error:.1f} mrad from its goal"
+        )
+    result.home = find_home(result)
+    return result
 
 
-def _mount(model: mujoco.MjModel, tip: str, wanted: str) -> str:
-    """Return the body or site that ends an arm."""
-    if wanted:
-        return wanted
+def _describe_rest(model: mujoco.MjModel, arm: ArmParts, left_out: list[str]) -> Iterator[str]:
+    """Yield notes about parts of the model that the draft leaves out, fixes or cannot limit."""
+    if left_out:
+        yield f"left out, because they are not attached: {listed(left_out)}"
+    if endless := [joint for joint in arm.joints if not model.joint(joint).limited]:
+        yield f"joints without limits: {listed(endless)}; [robot] position can state them"
+    if arm.passive:
+        yield (
+            f"passive joints beyond the arm: {listed([*arm.passive])}; those without a spring are"
+            " fixed; --joints drives them"
+        )
+    if arm.others:
+        yield f"fixed: other arms that begin at {listed([*arm.others])}; --tip chooses one of them"
+
+
+def _read_limits(
+    source: Source,
+    model: mujoco.MjModel,
+    spec: mujoco.MjSpec,
+    joints: Sequence[str],
+    wanted: Sequence[float],
+) -> JointLimits:
+    """Read the limits that the model or the user states, with provisional values for the rest.
+
+    Raises `RobotError` if nothing drives the arm and the user states no torques.
+    """
+    ids = {model.joint(joint).id for joint in joints}
+    if not (wanted or driven_joints(model) & ids):
+        why = "no actuator and no effort"
+        raise RobotError(f"{why} at {listed([*joints])}; --torque T,... states the limits")
+    torque = wanted or [stated_torque(spec, joint, spec.actuators) for joint in joints]
+    velocity = [source.velocity.get(joint, SPEED[spec.joint(joint).type]) for joint in joints]
+    return JointLimits(
+        *(velocity, velocity, velocity, [limit or 1e6 for limit in torque]),
+        unstated=[joint for joint in joints if joint not in source.velocity],
+        is_torque_stated=[bool(limit) for limit in torque],
+    )
+
+
+def _find_mount(model: mujoco.MjModel, tip: str) -> str:
+    """Find the last body that is fixed to the tip of an arm, preferably one named like a tool."""
     carried = [model.body(tip).id]
     for body in range(carried[0] + 1, model.nbody):
         if model.body_parentid[body] in carried and not model.body_jntnum[body]:
             carried.append(body)
     names = [model.body(body).name for body in carried]
-    named = [name for part in TOOLS for name in names[1:] if part in name.lower()]
+    named = [name for name_part in TOOLS for name in names[1:] if name_part in name.lower()]
     return str((named or names[-1:])[0])
 
 
-def _add_gripper(made: Draft) -> None:
-    """Add the gripper that the arm carries, if it can be used, and the tool between its fingers."""
-    wanted = made.wanted.gripper
-    arm = made.arm
+def _fit_gripper(draft: Draft) -> FittedGripper:
+    """Give the gripper of the arm one drive in the draft's model, and measure its fingers.
+
+    Raises `RobotError` if the gripper cannot be used.
+    """
+    wanted = draft.wishes.gripper
+    arm = draft.arm
     if wanted and wanted not in arm.fingers:
         raise RobotError(
             f"--gripper: no joint '{wanted}' beyond the arm; {listed(list(arm.fingers))}, none"
         )
-    try:
-        config, guess = fit_fingers(made.spec, compile_spec(made.spec, made.model), arm, wanted)
-        made.table["gripper"] = config
-        made.write_model()
-        cell = made.cell()
-        jaws = find_fingertips(cell, arm.tip)
-        if jaws.is_one:
-            pieces = cut_meshes(made.spec, cell, jaws.out)
-            why = f"; their meshes are cut to {pieces} convex pieces" if pieces else ""
-            made.notes.append(f"one finger closes on a fixed jaw{why}")
-            made.write_model()
-            jaws = find_fingertips(made.cell(), arm.tip, is_one=True)
-        config = config.model_copy(update={"open": round(jaws.opening, 5)})
-        made.table["gripper"] = config
-        cell = made.cell()
-        # Where home is, is not known yet: the fingers settle as if they were alone.
-        alone = np.isin(np.arange(cell.model.ngeom), cell.geoms.gripper)
-        cell.model.geom_contype *= alone
-        cell.model.geom_conaffinity *= alone
-        check_fingers(cell, config)
-    except RobotError as error:
-        made.notes.append(f"no gripper: {error}")
-        made.table.pop("gripper", None)
-        made.write_model()
-        made.hold(arm.joints)
-        return
-    if guess:
-        made.guessed["gripper"] = guess
-    made.jaws = jaws
-    if not made.wanted.tool:
-        made.table |= {"tool": arm.tip, "tool_offset": jaws.tool}
-        sides = "finger and fixed jaw" if jaws.is_one else "the fingers"
-        made.guessed["tool"] = f"between {sides}, z out of the hand, y across"
+    config, guess = fit_fingers(draft.spec, compile_spec(draft.spec, draft.model), arm, wanted)
+
+    draft.write_model()
+    cell = draft.cell(gripper=config)
+    fingertips = find_fingertips(cell, arm.tip)
+    notes = []
+    if fingertips.is_one:
+        pieces = cut_meshes(draft.spec, cell, fingertips.out)
+        why = f"; their meshes are cut to {pieces} convex pieces" if pieces else ""
+        notes.append(f"one finger closes on a fixed jaw{why}")
+        draft.write_model()
+        fingertips = find_fingertips(draft.cell(gripper=config), arm.tip, is_one=True)
+    config = config.model_copy(update={"open": round(fingertips.opening, 5)})
+    cell = draft.cell(gripper=config)
+    # Home is not known yet, so let the fingers settle without contacts with the rest of the arm.
+    is_gripper = np.isin(np.arange(cell.model.ngeom), cell.geoms.gripper)
+    cell.model.geom_contype *= is_gripper
+    cell.model.geom_conaffinity *= is_gripper
+    check_fingers(cell, config)
+    return FittedGripper(config, fingertips, guess, notes)
 
 
-def _exclude(made: Draft) -> None:
-    """Exclude contacts of bodies whose shapes always overlap."""
-    cell = made.cell()
+def _choose_tool(draft: Draft) -> ToolFrame:
+    """Place the tool between the fingers, or at the end of an arm without a usable gripper."""
+    if draft.gripper is None:
+        tool = tool_outward(draft.cell(), draft.tool.name)
+        return ToolFrame(*tool, "z along the last joint, outward")
+    fingertips = draft.gripper.fingertips
+    sides = "finger and fixed jaw" if fingertips.is_one else "the fingers"
+    guess = f"between {sides}, z out of the hand, y across"
+    return ToolFrame(draft.arm.tip, fingertips.tool, guess)
+
+
+def _find_overlaps(cell: Cell) -> tuple[tuple[str, str], ...]:
+    """Find pairs of bodies whose shapes overlap in nearly every pose."""
     set_margins(cell.model, SKIN_M)
     data = cell.start()
     count: Counter[tuple[str, str]] = Counter()
     for q in poses(cell):
         count.update(touching(cell, data, q))
-    pairs = tuple(sorted(pair for pair, n in count.items() if n >= ALWAYS * POSES))
-    if pairs:
-        made.table["exclude"] = pairs
-        made.guessed["exclude"] = "these bodies overlap in every pose"
+    return tuple(sorted(pair for pair, n in count.items() if n >= ALWAYS * POSES))
 
 
 def poses(cell: Cell) -> list[Array]:
-    """Return poses all over the joints' ranges, (joints,), rad."""
+    """Sample poses all over the joints' ranges, (joints,) each, rad."""
     low, high = sampling_range(cell)
     edge = 0.1 * (high - low)
     drawn = np.random.default_rng(0).uniform(low + edge, high - edge, (POSES, len(low)))
@@ -293,8 +383,16 @@ def poses(cell: Cell) -> list[Array]:
 def touching(
     cell: Cell, data: mujoco.MjData, q: Array, skin_m: float = SKIN_M
 ) -> set[tuple[str, str]]:
-    """Return the pairs of bodies in unintended contact at `q`, or closer than `skin_m`, if geoms
-    have that margin.
+    """Find pairs of bodies in unintended contact at a pose.
+
+    Args:
+        cell: The arm and its surroundings.
+        data: Simulation data of the cell. It is left at the pose.
+        q: Positions of the joints, (joints,), rad.
+        skin_m: Bodies closer than this, m, count as touching. The geoms need half of it as margin.
+
+    Returns:
+        Names of the bodies, sorted within each pair.
     """
     model = cell.model
     data.qpos[cell.qpos] = q
@@ -304,101 +402,107 @@ def touching(
     return {(first, second) for first, second in names}
 
 
-def _dimension(made: Draft, unknown: list[bool], guessed: list[bool]) -> None:
-    """Set the torques that are unknown, the velocities that are guessed, accelerations that the
-    motors can give, and a loop that is stiff against dry friction.
+def _compute_limits(draft: Draft) -> JointLimits:
+    """Compute the limits that the model does not state, and a loop stiff against dry friction.
+
+    Torques carry weight, friction and inertia; guessed velocities and all accelerations are what
+    the torques permit.
     """
-    cell = made.cell()
+    stated = draft.limits
+    cell = draft.cell()
     dynamics = Dynamics(cell)
-    velocity = np.array(made.table["velocity"])
+    velocity = np.array(stated.velocity)
     weight, drag, inertia = np.zeros((3, len(velocity)))
-    least = np.full(len(velocity), np.inf)
+    least_inertia = np.full(len(velocity), np.inf)
     for q in poses(cell):
         # The terms are views of one array.
         bias, still = (dynamics.terms(q, v).bias.copy() for v in (velocity, 0.0 * velocity))
         weight = np.maximum(weight, np.abs(still))
         drag = np.maximum(drag, np.abs(bias - still))
-        own = np.diag(dynamics.terms(q, velocity).inertia)
-        inertia = np.maximum(inertia, own)
-        least = np.minimum(least, own)
+        joint_inertia = np.diag(dynamics.terms(q, velocity).inertia)
+        inertia = np.maximum(inertia, joint_inertia)
+        least_inertia = np.minimum(least_inertia, joint_inertia)
     weight = weight + np.abs(dynamics.friction(velocity))
     wanted = velocity / SPEED_UP_S
-    torque = np.array(made.table["torque"])
-    torque = np.where(unknown, ROOM * (weight + drag + inertia * wanted), torque)
-    if any(unknown):
-        made.guessed["torque"] = f"{ROOM:g} times what weight, friction and inertia take"
-    room = torque - weight
-    slower = np.clip(DRAG_PART * room / np.maximum(drag, 1e-9), LEAST_PART, 1.0)
-    slower = np.where(guessed, slower, 1.0)
-    drag = slower * drag
-    made.table["velocity"] = _rounded(slower * velocity)
-    acceleration = np.clip(0.5 * (room - drag) / inertia, 0.1 * wanted, wanted)
-    made.guessed["acceleration"] = made.guessed["jerk"] = "by the torques"
-    made.table["torque"] = _rounded(torque)
-    made.table["acceleration"] = _rounded(acceleration)
-    made.table["jerk"] = _rounded(10.0 * acceleration)
-    held = float(np.max(dynamics.dry / least))  # rad/s2
-    needed = min(np.sqrt(held / REST_RAD), MOST_BANDWIDTH)
-    if needed > (usual := LoopGains().bandwidth):
-        made.bandwidth = round(float(needed), 1)
-        away = f"{1e3 * held / usual**2:.1f} mrad"
-        made.notes.append(
-            f"a joint loop of {made.bandwidth:g} rad/s: at {usual:g} dry friction may hold a joint"
-            f" {away} from its goal"
-        )
+    needed_torque = ROOM * (weight + drag + inertia * wanted)
+    torque = np.where(stated.is_torque_stated, stated.torque, needed_torque)
+    spare_torque = torque - weight
+    scale = np.clip(DRAG_PART * spare_torque / np.maximum(drag, 1e-9), LEAST_PART, 1.0)
+    scale[[joint not in stated.unstated for joint in draft.arm.joints]] = 1.0
+    acceleration = np.clip(0.5 * (spare_torque - scale * drag) / inertia, 0.1 * wanted, wanted)
+    friction_acceleration = float(np.max(dynamics.dry / least_inertia))  # rad/s2
+    needed = min(np.sqrt(friction_acceleration / REST_RAD), MOST_BANDWIDTH)
+    default = LoopGains().bandwidth
+    return replace(
+        stated,
+        velocity=_rounded(scale * velocity),
+        acceleration=_rounded(acceleration),
+        jerk=_rounded(10.0 * acceleration),
+        torque=_rounded(torque),
+        bandwidth=round(float(needed), 1) if needed > default else None,
+        friction_error=friction_acceleration / default**2,
+    )
 
 
 def _rounded(values: Array) -> list[float]:
     return [float(f"{value:.3g}") for value in values]
 
 
-def _home(
-    cell: Cell, checkers: Sequence[CollisionChecker], starts: Mapping[str, Array], wanted: str
-) -> tuple[list[float], str]:
-    """Return home, and why if it is a guess: a keyframe that serves, or the best pose that does.
-    Raises `RobotError`.
+def find_home(draft: Draft, scene: SceneConfig = NOTHING, ends: Sequence[Array] = ()) -> HomePose:
+    """Find a home in which the arm carries itself and touches nothing.
+
+    A keyframe that qualifies is preferred. The alternative is the best sampled pose.
+
+    Args:
+        draft: The arm. Its `home` is not used.
+        scene: Objects and supports beside the arm.
+        ends: Final positions of the objects, (3,) each, m. The pose is also free of contact after
+            the objects have been moved there.
+
+    Raises:
+        RobotError: No sampled pose qualifies, or the keyframe that the user named is unknown.
     """
-    first, *later = checkers
+    wanted = draft.wishes.home
+    keyframes = draft.keyframes
+    cell = draft.cell(scene)
+    data = cell.start()
+    checker = CollisionChecker(cell, scene)
+    later = CollisionChecker(cell, scene)
+    if ends:
+        later.place(np.array(ends), data.xquat[cell.bodies])
     statics = Statics(cell)
     low, high = cell.limits.position.T
 
     def left(q: Array) -> float:
-        """Return the part of the torques that gravity leaves; negative: the pose does not serve."""
+        """Return the fraction of torque that gravity leaves, or -1 for an unusable pose."""
         is_within = np.all(q >= low) and np.all(q <= high)
-        if is_within and first.free(q, 0.0) and all(checker.free(q) for checker in later):
+        if is_within and checker.free(q, 0.0) and (not ends or later.free(q)):
             return float(statics.held(q)[0].min()) - LEAST_PART
         return -1.0
 
-    if wanted and wanted not in starts:
+    if wanted and wanted not in keyframes:
         try:
-            return [float(value) for value in wanted.split(",")], ""
+            return HomePose([float(value) for value in wanted.split(",")])
         except ValueError:
-            known = listed(list(starts))
+            known = listed(list(keyframes))
             raise RobotError(
-                f"--home: '{wanted}' is no keyframe: {known}; valid, too: q1,q2,..."
+                f"--home: '{wanted}' is not a keyframe; valid: {known}, or q1,q2,..."
             ) from None
-    named = sorted(starts, key=lambda name: name != (wanted or "home"))
+    named = sorted(keyframes, key=lambda name: name != (wanted or "home"))
     for name in named:
-        if left(starts[name]) > 0:
-            return starts[name].round(5).tolist(), ""
-    data = cell.start()
+        if left(keyframes[name]) > 0:
+            return HomePose(keyframes[name].round(5).tolist())
     set_margins(cell.model, 0.5 * APART_M)
 
-    def rating(q: Array) -> float:
+    def rate_pose(q: Array) -> float:
+        # Forward kinematics at `q` is a side effect of `find_touching_bodies`.
         is_near = bool(touching(cell, data, q, APART_M))
-        return left(q) + _downward(first, cell, q) - 2.0 * is_near
+        downward = -float(data.site_xmat[cell.tool, 8])
+        return left(q) + downward - 2.0 * is_near
 
-    found = [(rating(q), q) for q in poses(cell) if left(q) > 0]
-    if not found:
+    best = max((q for q in poses(cell) if left(q) > 0), key=rate_pose, default=None)
+    if best is None:
         raise RobotError(
-            "no pose is free of contact and carries itself; --home q1,q2,... states one"
+            "no pose was found that is free of contact and held by the motors; give one with --home"
         )
-    best = max(found, key=lambda pair: pair[0])[1]
-    return best.round(4).tolist(), "free of contact, the tool as far down as found"
-
-
-def _downward(checker: CollisionChecker, cell: Cell, q: Array) -> float:
-    """Return how far the tool points down, -1 to 1."""
-    turned = np.zeros(9)
-    mujoco.mju_quat2Mat(turned, checker.tool_at(q).quaternion)
-    return -float(turned[8])
+    return HomePose(best.round(4).tolist(), "free of contact, the tool as far down as found")

@@ -1,4 +1,4 @@
-"""What is to be known of an arm before it moves: its joints, what it can do, and what is wrong."""
+"""Examines an arm before it moves: its joints, its abilities, and what is wrong with it."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from rack.tools.console.answer import Document
 from rack.tools.robot.draft import touching
 
 MOST_TURN = 0.5
-"""Angle of the fastest vibration in one step, rad, at which its simulation is sound."""
+"""Largest phase angle of a vibration in one step, rad, at which its simulation is trustworthy."""
 
 
 @dataclass(frozen=True)
 class Observation:
-    """One thing that was looked at."""
+    """Result of one check, which may be a failure."""
 
     about: str
     text: str
@@ -34,7 +34,7 @@ class Observation:
 
 @dataclass(frozen=True)
 class Examined:
-    """An arm, examined."""
+    """An arm with the results of its examination."""
 
     cell: Cell
     joints: list[Document]
@@ -43,7 +43,16 @@ class Examined:
 
 
 def examine(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> Examined:
-    """Examine an arm in its cell; contacts at home are found, not refused. Raises `RobotError`."""
+    """Examine an arm in its cell. Contacts at home are reported, not refused.
+
+    Args:
+        robot: Table of the arm.
+        scene: Objects and supports around it.
+        clock_ns: Clock period.
+
+    Raises:
+        RobotError: The cell cannot be built.
+    """
     cell = unchecked_cell(robot, scene, clock_ns)
     able = abilities(cell)
     findings = list(_findings(cell, robot, scene, able))
@@ -51,6 +60,7 @@ def examine(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> Examined:
 
 
 def _joints(cell: Cell, robot: RobotConfig) -> Iterator[Document]:
+    """Yield a row of figures for each joint."""
     data = cell.start()
     left, _ = Statics(cell).held(cell.home)
     for k, name in enumerate(robot.joints):
@@ -70,42 +80,53 @@ def _joints(cell: Cell, robot: RobotConfig) -> Iterator[Document]:
 def _findings(
     cell: Cell, robot: RobotConfig, scene: SceneConfig, able: Abilities
 ) -> Iterator[Observation]:
+    """Yield the result of each check."""
     model = cell.model
     data = cell.start()
     low, high = cell.limits.position.T
-    off = [
+    outside = [
         n for n, q, a, b in zip(robot.joints, cell.home, low, high, strict=True) if not a <= q <= b
     ]
-    yield Observation("home", f"outside its limits: {', '.join(off) or 'no joint'}", bool(off))
-    weak = able.left < 0.0
-    held = f"gravity takes {100 * (1 - able.left):.0f} % of '{robot.joints[able.joint]}' at worst"
-    yield Observation("weight", held, weak)
+    yield Observation(
+        "home", f"outside its limits: {', '.join(outside) or 'no joint'}", bool(outside)
+    )
+    is_too_weak = able.left < 0.0
+    weight_text = (
+        f"gravity takes {100 * (1 - able.left):.0f} % of '{robot.joints[able.joint]}' at worst"
+    )
+    yield Observation("weight", weight_text, is_too_weak)
     pairs = sorted(" and ".join(pair) for pair in touching(cell, data, cell.home))
     yield Observation("contacts at home", ", ".join(pairs) or "none", bool(pairs))
-    known = {*cell.qpos, *cell.object_qpos, *model.jnt_qposadr[model.jnt_stiffness > 0.0]}
+    known_addresses = {*cell.qpos, *cell.object_qpos, *model.jnt_qposadr[model.jnt_stiffness > 0.0]}
     if cell.gripper is not None:
-        known |= {cell.gripper.linkage.driven, *cell.gripper.linkage.joints}
-    loose = {
-        int(model.jnt_bodyid[k]) for k in range(model.njnt) if model.jnt_qposadr[k] not in known
+        known_addresses |= {cell.gripper.linkage.driven, *cell.gripper.linkage.joints}
+    loose_bodies = {
+        int(model.jnt_bodyid[k])
+        for k in range(model.njnt)
+        if model.jnt_qposadr[k] not in known_addresses
     }
-    names = sorted(model.body(body).name for body in loose)
-    yield Observation("bodies that nothing holds", ", ".join(names) or "none", bool(names))
+    names = sorted(model.body(body).name for body in loose_bodies)
+    yield Observation("unattached bodies", ", ".join(names) or "none", bool(names))
     kinds = Counter(map(_kind, load_spec(robot.model).actuators))
     yield Observation(
         "actuators", ", ".join(f"{n} {kind}" for kind, n in kinds.items()) or "none", False
     )
     if robot.gripper is not None:
-        why = _elsewhere(cell, robot.gripper)
-        yield Observation("coupling", why or "fingers settle where planning poses them", bool(why))
+        coupling_error = _elsewhere(cell, robot.gripper)
+        yield Observation(
+            "coupling",
+            coupling_error or "fingers settle where planning poses them",
+            bool(coupling_error),
+        )
         yield Observation("fingers", _facing(cell, scene), False)
-    turn, spring = _fastest(cell)
-    needed = int(np.ceil(robot.substeps * turn / MOST_TURN)) or 1
-    text = f"{spring:.3g} Hz at most; {needed} of {robot.substeps} substeps are enough"
-    yield Observation("natural frequency", text, needed > robot.substeps)
-    below = np.full(1, -1, dtype=np.int32)
+    phase, spring = _fastest(cell)
+    needed_substeps = int(np.ceil(robot.substeps * phase / MOST_TURN)) or 1
+    text = f"{spring:.3g} Hz at most; {needed_substeps} of {robot.substeps} substeps are enough"
+    yield Observation("natural frequency", text, needed_substeps > robot.substeps)
+    hit_geom = np.full(1, -1, dtype=np.int32)
     for body in cell.bodies[: len(cell.object_qpos)]:
-        mujoco.mj_ray(model, data, data.xpos[body], np.array(DOWN), None, 1, int(body), below)
-        if below[0] < 0:
+        mujoco.mj_ray(model, data, data.xpos[body], np.array(DOWN), None, 1, int(body), hit_geom)
+        if hit_geom[0] < 0:
             yield Observation("objects", f"'{model.body(body).name}' falls without end", True)
     if robot.guessed:
         yield Observation("guessed", ", ".join(robot.guessed), False)
@@ -118,7 +139,7 @@ def _kind(actuator: mujoco.MjsActuator) -> str:
 
 
 def _facing(cell: Cell, scene: SceneConfig) -> str:
-    """Return what closes at the tool, and how far it opens there."""
+    """Describe what closes at the tool, and how far it opens."""
     payloads = Payloads(cell, scene.objects)
     if not payloads.jaws:
         return "none on both sides of the tool, along its y axis"
@@ -129,7 +150,7 @@ def _facing(cell: Cell, scene: SceneConfig) -> str:
 
 
 def _elsewhere(cell: Cell, config: GripperConfig) -> str:
-    """Return why the fingers do not settle where planning poses them; empty: they do."""
+    """Return why the fingers do not settle where planning poses them, or an empty text."""
     try:
         check_fingers(cell, config)
     except RobotError as error:
@@ -138,8 +159,10 @@ def _elsewhere(cell: Cell, config: GripperConfig) -> str:
 
 
 def _fastest(cell: Cell) -> tuple[float, float]:
-    """Return the fastest vibration against springs and the gripper's loop: its angle in a step,
-    rad, and its frequency, Hz.
+    """Find the fastest vibration against springs and the loop of the gripper.
+
+    Returns:
+        Its phase angle in one step, rad, and its frequency, Hz.
     """
     model = cell.model
     data = cell.start()
@@ -148,6 +171,8 @@ def _fastest(cell: Cell) -> tuple[float, float]:
     stiffness = model.jnt_stiffness[model.dof_jntid].copy()
     if cell.gripper is not None:
         stiffness[cell.gripper.dof] += cell.gripper.stiffness
-    squared = np.linalg.eigvals(np.linalg.solve(inertia, np.diag(stiffness))).real.max(initial=0.0)
-    speed = float(np.sqrt(max(squared, 0.0)))
-    return speed * model.opt.timestep, speed / (2.0 * np.pi)
+    squared_frequency = np.linalg.eigvals(np.linalg.solve(inertia, np.diag(stiffness))).real.max(
+        initial=0.0
+    )
+    angular_frequency = float(np.sqrt(max(squared_frequency, 0.0)))
+    return angular_frequency * model.opt.timestep, angular_frequency / (2.0 * np.pi)

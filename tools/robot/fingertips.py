@@ -1,5 +1,6 @@
-"""What the fingers of a gripper can take, and the tool between them, by rays on their surfaces: two
-fingers, or one that closes on a jaw that stands still.
+"""Measures by rays what the fingers of a gripper can take, and places the tool between them.
+
+Two kinds are supported: fingers that close on each other, and one that closes on a fixed jaw.
 """
 
 from __future__ import annotations
@@ -18,81 +19,95 @@ from rack.levels.robot.lookup import below
 from rack.levels.tables import ToolConfig
 
 STEP_M = 0.0025
-"""Spacing of the places between the fingers that are tried."""
+"""Spacing of the points between the fingers at which rays are cast."""
 FROM_TIP_M = 0.012
-"""Depth of the tool's origin between the fingers."""
+"""Distance of the tool's origin from the tips of the fingers."""
 ROOM_M = 0.001
-"""From a jaw that stands still to the line along which places next to it are tried."""
+"""Distance from the surface of a fixed jaw to the line of points that are tried."""
 BLOCK_PART = 0.5
 FACING_PART = 0.35
-"""Widths of a block in that between fingers, and between a jaw and a finger: one that turns faces
-the jaw only when it is nearly closed."""
+"""Width of a block as a fraction of the gap, with two fingers, and with one finger and a jaw.
+
+A finger that turns faces its jaw only when it is nearly closed.
+"""
 LEAST_GAP_M = 0.012
-"""A gripper that opens less has no use for a block."""
+"""A gripper that opens less than this cannot take a block."""
 NEARLY, NEARER = 0.6, 0.85
-"""Parts of the way to closed, near enough to tell where the fingers will meet, and where a single
-one meets its jaw: if it turns, its tip is there only when it is nearly closed."""
+"""Fractions of the way to closed at which the meeting point is measured: two fingers, one finger.
+
+The tip of a single turning finger is near its jaw only when it is nearly closed.
+"""
 LEAST_WAY_M = 1e-4
+"""A geom that moves less than this does not belong to a finger."""
 FINGERS, STILL = np.eye(6, dtype=np.uint8)[1:3]
-"""Groups of geoms, for rays: what closes; what a single finger closes on."""
+"""Geom groups that a ray can hit: moving fingers, and the jaw that a single finger closes on."""
 ASIDE_M = (0.0, 0.01, -0.01, 0.02, -0.02)
-"""Where a ray between the fingers starts, besides the middle: the two of three leave a gap."""
+"""Sideways offsets at which rays start, in order: the middle of three fingers may miss the others.
+"""
 ALIGNED = 0.98
-"""Cosine above which a direction is that of the body's axis."""
+"""Cosine above which a direction is replaced by the axis of the body."""
 ABOUT = 0.9
-"""The same for the way out to a single finger, whose middle is to one side of the hand's."""
+"""Like `ALIGNED_COSINE`, for the direction to a single finger, which is beside the hand's centre.
+"""
 
 
 class Fingertips(NamedTuple):
-    """What two fingers, or a finger and a jaw, can take."""
+    """Measures of what two fingers, or a finger and a jaw, can take."""
 
     tool: ToolConfig  # z out of the hand, y across
     opening: float  # m or rad: the widest at which they face each other
     block: float  # width of a block for them, m
-    below: float  # how far they reach beyond the tool, m
-    is_one: bool  # one finger closes on a jaw that stands still
+    below: float  # length of the fingers beyond the tool, m
+    is_one: bool  # True for one finger that closes on a fixed jaw
     out: Array  # (3,), z of the tool with the arm at its start
 
 
 def find_fingertips(cell: Cell, tip: str, is_one: bool = False) -> Fingertips:
-    """Return what the gripper can take; `is_one` is known of meshes cut to pieces. Raises
-    `RobotError` where nothing closes, or not on a block.
+    """Measure what a gripper can take, and place the tool between its fingers.
+
+    Args:
+        cell: The arm with its gripper.
+        tip: Body that carries the gripper.
+        is_one: True if the gripper is known to have one finger, because its meshes have been cut.
+
+    Raises:
+        RobotError: The fingers do not close on each other or on a jaw, or open too little.
     """
     fingers = _Fingers(cell, tip, is_one)
     out = fingers.out
     across = fingers.across
-    between = [place for place in fingers.places() if np.isfinite(fingers.gap(place)).all()]
-    if not between:
-        raise RobotError("fingers that do not close on each other, nor on a jaw")
-    origin = between[min(int(FROM_TIP_M / STEP_M), len(between) // 2)]
+    points = [place for place in fingers.places() if np.isfinite(fingers.gap(place)).all()]
+    if not points:
+        raise RobotError("the fingers close neither on each other nor on a jaw")
+    origin = points[min(int(FROM_TIP_M / STEP_M), len(points) // 2)]
     left, right = fingers.gap(origin)
     if not fingers.is_one:
         origin = origin + 0.5 * (left - right) * across
-    for part in np.linspace(0.0, fingers.near, 16 if fingers.is_one else 8):
-        fingers.close(part)
+    for fraction in np.linspace(0.0, fingers.near, 16 if fingers.is_one else 8):
+        fingers.close(fraction)
         width = sum(fingers.gap(origin))
         if np.isfinite(width):
             break
     if not LEAST_GAP_M < width < np.inf:
         raise RobotError(
-            f"fingers that open {1e3 * width:.0f} mm; {1e3 * LEAST_GAP_M:g} are needed"
+            f"the fingers open by {1e3 * width:.0f} mm; {1e3 * LEAST_GAP_M:g} mm are needed"
         )
     block = BLOCK_PART * width
     if fingers.is_one:
         block = FACING_PART * width
         origin = origin + (0.5 * block - right) * across
     # Fingers that turn reach farther as they close.
-    ends = []
-    for step in np.linspace(part, 1.0, 5):
+    reaches = []
+    for step in np.linspace(fraction, 1.0, 5):
         fingers.close(step)
-        ends.append(farthest(cell.model, fingers.data, fingers.geoms, out))
-    reach = max(ends) - float(origin @ out)
+        reaches.append(farthest(cell.model, fingers.data, fingers.geoms, out))
+    reach = max(reaches) - float(origin @ out)
     tool = _placed(fingers.data, cell.model.body(tip).id, origin, across, out)
-    return Fingertips(tool, fingers.opening(float(part)), block, reach, fingers.is_one, out)
+    return Fingertips(tool, fingers.opening(float(fraction)), block, reach, fingers.is_one, out)
 
 
 class _Fingers:
-    """The solid geoms of a gripper, closed to one part after the other, and where they meet."""
+    """The solid geoms of a gripper, which can be closed by any fraction."""
 
     def __init__(self, cell: Cell, tip: str, is_one: bool) -> None:
         assert cell.gripper is not None, "there are fingers"
@@ -103,73 +118,86 @@ class _Fingers:
         solid = (model.geom_contype | model.geom_conaffinity) != 0
         self.geoms = cell.geoms.gripper[solid[cell.geoms.gripper]]
         closed = self.close(1.0)
-        ways = self.close(NEARLY) - closed
-        moving = np.linalg.norm(ways, axis=1) > LEAST_WAY_M
-        if not moving.any():
-            raise RobotError("fingers that do not move")
-        ways = ways[moving]
-        self.is_one = is_one or bool((ways @ ways.T).min() >= 0.0)
+        displacements = self.close(NEARLY) - closed
+        is_moving = np.linalg.norm(displacements, axis=1) > LEAST_WAY_M
+        if not is_moving.any():
+            raise RobotError("the fingers do not move")
+        displacements = displacements[is_moving]
+        self.is_one = is_one or bool((displacements @ displacements.T).min() >= 0.0)
         self.near = NEARER if self.is_one else NEARLY
-        # Of the gripper, rays see what is solid, of the rest nothing.
+        # Rays hit the solid geoms of the gripper and nothing else.
         model.geom_group[:] = 0
-        model.geom_group[self.geoms] = 1 + (self.is_one & ~moving)
+        model.geom_group[self.geoms] = 1 + (self.is_one & ~is_moving)
         hand = model.body(tip).id
         axes = self.data.xmat[hand].reshape(3, 3).T
-        half = self.close(self.near)[moving]
+        nearly_closed = self.close(self.near)[is_moving]
         if self.is_one:
-            across = ways.mean(axis=0)
-            self._middle = half.mean(axis=0)
-            out = _snapped(closed[moving].mean(axis=0) - self.data.xpos[hand], axes, ABOUT)
+            across = displacements.mean(axis=0)
+            self._middle = nearly_closed.mean(axis=0)
+            out = _snapped(closed[is_moving].mean(axis=0) - self.data.xpos[hand], axes, ABOUT)
         else:
-            across = np.linalg.svd(ways - ways.mean(axis=0))[2][0]
-            side = ways @ across > 0
-            self._middle = 0.5 * (half[side].mean(axis=0) + half[~side].mean(axis=0))
+            across = np.linalg.svd(displacements - displacements.mean(axis=0))[2][0]
+            side = displacements @ across > 0
+            self._middle = 0.5 * (
+                nearly_closed[side].mean(axis=0) + nearly_closed[~side].mean(axis=0)
+            )
             out = self._middle - self.data.xpos[hand]
             out = _snapped(out - across * (across @ out), axes)
         self.out = out  # (3,), of the hand
         self.across = _snapped(across - out * (across @ out), axes)  # (3,)
 
     def opening(self, part: float) -> float:
-        """Return the position of the driven joint, m or rad."""
+        """Return the position of the driven joint, m or rad, at a fraction of the way to closed."""
         return self._gripper.open + part * (self._gripper.closed - self._gripper.open)
 
     def close(self, part: float) -> Array:
-        """Close the gripper to a part; return the middles of its geoms, (geoms, 3), m."""
+        """Close the gripper by a fraction, 0 to 1.
+
+        Returns the centres of its geoms, (geoms, 3), m.
+        """
         self._gripper.linkage.set(self.data.qpos, self.opening(part))
         mujoco.mj_forward(self._model, self.data)
         return np.array(self.data.geom_xpos[self.geoms])
 
     def gap(self, at: Array) -> tuple[float, float]:
-        """Return the distances from a place to the fingers on both sides, m; inf: none."""
+        """Measure the distances from a point to the fingers on both sides, m.
+
+        Infinite without a hit.
+        """
         other = STILL if self.is_one else FINGERS
         return self._ray(at, self.across, FINGERS), self._ray(at, -self.across, other)
 
     def places(self) -> list[Array]:
-        """Return places between the fingers, the outermost first; of a single finger next to the
-        jaw.
-        """
-        places = [self._middle + self.out * step * STEP_M for step in range(60, -40, -1)]
+        """List points between the fingers, or beside a fixed jaw, the outermost first."""
+        points = [self._middle + self.out * step * STEP_M for step in range(60, -40, -1)]
         if not self.is_one:
-            return places
-        # From inside the finger to next to the jaw, as it is near its tip.
-        found = np.array([self._ray(place, -self.across, STILL) for place in places])
-        at_tip = found[np.isfinite(found)][: int(FROM_TIP_M / STEP_M)]
+            return points
+        # Move the points from inside the finger to the surface of the jaw near its tip.
+        distances = np.array([self._ray(point, -self.across, STILL) for point in points])
+        at_tip = distances[np.isfinite(distances)][: int(FROM_TIP_M / STEP_M)]
         if not len(at_tip):
             return []
-        return [place - (at_tip.min() - ROOM_M) * self.across for place in places]
+        return [point - (at_tip.min() - ROOM_M) * self.across for point in points]
 
-    def _ray(self, at: Array, way: Array, group: NDArray[np.uint8]) -> float:
-        starts = (at + aside * np.cross(self.across, self.out) for aside in ASIDE_M)
+    def _ray(self, point: Array, direction: Array, group: NDArray[np.uint8]) -> float:
+        """Return the distance to the first geom of a group in a direction, m, or infinity."""
+        starts = (point + aside * np.cross(self.across, self.out) for aside in ASIDE_M)
         rays = (
-            mujoco.mj_ray(self._model, self.data, start, way, group, 1, -1, None)
+            mujoco.mj_ray(self._model, self.data, start, direction, group, 1, -1, None)
             for start in starts
         )
         return next((distance for distance in rays if distance >= 0), np.inf)
 
 
 def tool_outward(cell: Cell, body: str) -> tuple[str, ToolConfig | None]:
-    """Return the tool of an arm that ends at a body, z along the last joint, outward: a site of the
-    model, or a place on the body.
+    """Choose a tool frame whose z axis points along the last joint, away from the arm.
+
+    Args:
+        cell: The arm.
+        body: Body at the end of the arm.
+
+    Returns:
+        A site of the model, or the body with the pose of the tool on it.
     """
     model = cell.model
     data = cell.start()
@@ -193,19 +221,33 @@ def tool_outward(cell: Cell, body: str) -> tuple[str, ToolConfig | None]:
 
 
 def _snapped(way: Array, axes: Array, least: float = ALIGNED) -> Array:
-    """Return a unit vector, that of an axis where it is about that."""
+    """Normalize a direction, and replace it by an axis that is nearly parallel to it.
+
+    Args:
+        way: The direction, (3,).
+        axes: Candidates, (3, 3), one in each row.
+        least: Least cosine between direction and axis.
+    """
     way = way / norm(way)
     along = axes @ way
-    best = int(np.argmax(np.abs(along)))
-    return np.sign(along[best]) * axes[best] if abs(along[best]) > least else way
+    nearest = int(np.argmax(np.abs(along)))
+    return np.sign(along[nearest]) * axes[nearest] if abs(along[nearest]) > least else way
 
 
 def _placed(data: mujoco.MjData, body: int, origin: Array, across: Array, out: Array) -> ToolConfig:
-    """Return a frame of the world as one on a body: its origin, its y and its z axis, (3,) each."""
-    turned = np.stack((np.cross(across, out), across, out), axis=1)
-    own = data.xmat[body].reshape(3, 3)
+    """Convert a frame in the world to a frame on a body.
+
+    Args:
+        data: Simulation data with the pose of the body.
+        body: Id of the body.
+        origin: Origin of the frame, (3,), m.
+        across: Its y axis, (3,).
+        out: Its z axis, (3,).
+    """
+    axes = np.stack((np.cross(across, out), across, out), axis=1)
+    body_axes = data.xmat[body].reshape(3, 3)
     quaternion = np.zeros(4)
-    mujoco.mju_mat2Quat(quaternion, (own.T @ turned).ravel())
-    position = own.T @ (origin - data.xpos[body])
+    mujoco.mju_mat2Quat(quaternion, (body_axes.T @ axes).ravel())
+    position = body_axes.T @ (origin - data.xpos[body])
     frame = {"position": position.round(5).tolist(), "quaternion": quaternion.round(6).tolist()}
     return ToolConfig.model_validate(frame)

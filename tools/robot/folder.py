@@ -1,4 +1,4 @@
-"""What `rack robot new` writes: a config with comments, the model that it names, a picture."""
+"""Writes the config of a drafted arm, with comments that name each guess."""
 
 from __future__ import annotations
 
@@ -23,27 +23,34 @@ extends = ["nasrem"]
 STIFF = "stiff enough against dry friction"
 
 
-def config_text(made: Draft, layout: Assignment, name: str, model: Path) -> str:
-    """Return the config of a drafted arm."""
+def config_text(draft: Draft, layout: Assignment, name: str, model: Path) -> str:
+    """Format the config of a drafted arm.
+
+    Args:
+        draft: The arm.
+        layout: Its scene and task.
+        name: Name of the rack.
+        model: The user's model file, which is named in a comment.
+    """
     head = HEAD.format(name=name, model=model.name)
-    return head + "\n".join(_lines(made, layout, name)) + "\n"
+    return head + "\n".join(_lines(draft, layout, name)) + "\n"
 
 
-def _lines(made: Draft, layout: Assignment, name: str) -> Iterator[str]:
-    table: dict[str, Any] = {"guessed": list(made.guessed), **made.table, "model": f"{name}.xml"}
-    table = {key: value for key, value in table.items() if value is not None}
-    inner = {key: value for key, value in table.items() if isinstance(value, Table)}
-    yield from _keys({k: v for k, v in table.items() if k not in inner}, made.guessed)
-    for key, value in inner.items():
-        yield f"\n[robot.{key}]" + _comment(made.guessed.get(key))
-        inside = value.model_dump(exclude_none=True)
-        follow = inside.pop("follow", ())
-        yield from _keys(inside, {})
-        for one in follow:
+def _lines(draft: Draft, layout: Assignment, name: str) -> Iterator[str]:
+    """Yield the lines of the config after its head."""
+    table: dict[str, Any] = {"guessed": list(draft.guessed), **draft.table, "model": f"{name}.xml"}
+    subtables = {key: value for key, value in table.items() if isinstance(value, Table)}
+    yield from _keys({k: v for k, v in table.items() if k not in subtables}, draft.guessed)
+    for key, value in subtables.items():
+        yield f"\n[robot.{key}]" + _comment(draft.guessed.get(key))
+        settings = value.model_dump(exclude_none=True)
+        follow = settings.pop("follow", ())
+        yield from _keys(settings, {})
+        for follower in follow:
             yield f"[[robot.{key}.follow]]"
-            yield from _keys(one, {})
-    if made.bandwidth is not None:
-        yield f"\n[board.servo.params]\nbandwidth = {made.bandwidth:g}" + _comment(STIFF)
+            yield from _keys(follower, {})
+    if draft.limits.bandwidth is not None:
+        yield f"\n[board.servo.params]\nbandwidth = {draft.limits.bandwidth:g}" + _comment(STIFF)
     yield "\n[scene]"
     yield from _keys({"objects": layout.scene.objects, "supports": layout.scene.supports}, {})
     yield f"\n[task]  # {layout.kind}"
@@ -53,7 +60,8 @@ def _lines(made: Draft, layout: Assignment, name: str) -> Iterator[str]:
 
 
 def _keys(table: Mapping[str, Any], guessed: Mapping[str, str]) -> Iterator[str]:
-    # Of numbers, texts and lists JSON is TOML.
+    """Yield a line of TOML for each key, with the reason of a guess as a comment."""
+    # For numbers, texts and lists JSON and TOML are the same.
     for key, value in table.items():
         yield f"{key} = {encode_json(value)}" + _comment(guessed.get(key))
 
@@ -62,13 +70,20 @@ def _comment(guess: str | None) -> str:
     return f"  # guessed: {guess}" if guess else ""
 
 
-def document(made: Draft, layout: Assignment, folder: Path, name: str) -> dict[str, Any]:
-    """Return what was made as plain data."""
+def document(draft: Draft, layout: Assignment, folder: Path, name: str) -> dict[str, Any]:
+    """Return the answer to `--json`.
+
+    Args:
+        draft: The arm.
+        layout: Its scene and task.
+        folder: Folder to which the config is written.
+        name: Name of the rack.
+    """
     return {
         "robot": name,
         "folder": str(folder),
-        "joints": made.arm.joints,
+        "joints": draft.arm.joints,
         "task": layout.kind,
-        "guessed": made.guessed,
-        "notes": made.notes,
+        "guessed": draft.guessed,
+        "notes": draft.notes,
     }

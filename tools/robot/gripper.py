@@ -1,4 +1,4 @@
-"""The gripper that an arm carries: one joint drives it, the others follow."""
+"""Fits the gripper that an arm carries with one drive, which all its other joints follow."""
 
 from __future__ import annotations
 
@@ -18,56 +18,74 @@ from rack.tools.robot.arm import ArmParts
 MOTOR = "gripper"
 """Name of the motor of a gripper that has none."""
 FORCE_N = 20.0
-"""Of a gripper whose model says nothing, at its fingers."""
+"""Force at the fingers of a gripper whose model states none."""
 MOST_FORCE_N = 40.0
-"""At the fingers, beyond their dry friction; of more, which pushes a light block out, no use is
-made."""
+"""Upper bound for the force at the fingers beyond friction. More would push out a light block."""
 LEAST_LEVER_M = 0.02
+"""Lower bound for the lever arm of a finger that turns."""
 SIDEWAYS = 0.5
-"""Cosine between a finger's motion and the way to the others below which it does not close."""
+"""A finger does not close if the cosine between its motion and the way to the others is below this.
+"""
 
 
 class _Finger(NamedTuple):
+    """One joint of a gripper, with its ends in m or rad."""
+
     open: float
     closed: float
     lever: float  # m; 1 for a slide
-    sideways: bool  # spreads the fingers, rather than closes them
+    sideways: bool  # True if it spreads the fingers instead of closing them
 
 
 def fit_fingers(
     spec: mujoco.MjSpec, model: mujoco.MjModel, arm: ArmParts, wanted: str
 ) -> tuple[GripperConfig, str]:
-    """Give the gripper one drive, at the joint `wanted` if that is named, which all that nothing
-    couples to it follows; return its table, and what of it is guessed. Raises `RobotError`.
+    """Give a gripper one drive, which all joints follow that nothing couples to it.
+
+    Args:
+        spec: The model. Surplus actuators are removed, and a missing one is added.
+        model: The same model, compiled.
+        arm: The arm that carries the gripper.
+        wanted: Joint to be driven. Empty to prefer one with an actuator that closes the fingers.
+
+    Returns:
+        The gripper's table, and a text that names what in it is guessed.
+
+    Raises:
+        RobotError: A joint of the gripper has no range.
     """
     fingers = {name: _finger(spec, model, arm, name) for name in arm.fingers}
     drives = [
-        (actuator, found[0])
+        (actuator, driven_fingers[0])
         for actuator in spec.actuators
-        if (found := [joint for joint in driven_by(spec, actuator) if joint in fingers])
+        if (driven_fingers := [joint for joint in driven_by(spec, actuator) if joint in fingers])
     ]
     drives.sort(key=lambda drive: (drive[1] != wanted, fingers[drive[1]].sideways))
     driven = drives[0][1] if drives else wanted or arm.fingers[0]
-    own = fingers[driven]
-    first = [joint for _, joint in drives] + list(arm.fingers)
+    driven_finger = fingers[driven]
+    preferred = [joint for _, joint in drives] + list(arm.fingers)
     groups = [group for group in _groups(model, arm) if driven not in group]
-    leaders = [min(group, key=first.index) for group in groups]
+    leaders = [min(group, key=preferred.index) for group in groups]
     follow = tuple(
-        FollowConfig(joint=name, ratio=_ratio(model, (driven, own), (name, fingers[name])))
+        FollowConfig(
+            joint=name, ratio=_ratio(model, (driven, driven_finger), (name, fingers[name]))
+        )
         for name in leaders
-        if name in first[: len(drives)] or not model.jnt_stiffness[model.joint(name).id]
+        if name in preferred[: len(drives)] or not model.jnt_stiffness[model.joint(name).id]
     )
-    # One drive gives what all those gave that it stands for.
-    moving = [driven, *(one.joint for one in follow if one.ratio)]
+    # The one drive gives the sum of the forces of all drives that it replaces.
+    moving_joints = [driven, *(follower.joint for follower in follow if follower.ratio)]
     actuators = [actuator for actuator, _ in drives]
-    stated = [stated_torque(spec, name, actuators) for name in moving]
-    levers = [fingers[name].lever for name in moving]
-    dry = model.dof_frictionloss[[model.joint(name).dofadr[0] for name in moving]].tolist()
-    used = [
-        min(known or FORCE_N * lever + rub, MOST_FORCE_N * lever + rub)
-        for known, lever, rub in zip(stated, levers, dry, strict=True)
+    stated = [stated_torque(spec, name, actuators) for name in moving_joints]
+    levers = [fingers[name].lever for name in moving_joints]
+    dry_friction = model.dof_frictionloss[
+        [model.joint(name).dofadr[0] for name in moving_joints]
+    ].tolist()
+    forces = [
+        min(stated_force or FORCE_N * lever + friction, MOST_FORCE_N * lever + friction)
+        for stated_force, lever, friction in zip(stated, levers, dry_friction, strict=True)
     ]
-    force = sum(used)
+    force = sum(forces)
     remove(spec, actuators[1:])
     if drives:
         motor = actuators[0].name
@@ -77,26 +95,28 @@ def fit_fingers(
     config = GripperConfig(
         actuator=motor,
         joint=driven,
-        open=round(own.open, 5),
-        closed=round(own.closed, 5),
+        open=round(driven_finger.open, 5),
+        closed=round(driven_finger.closed, 5),
         force=round(force, 3),
         follow=follow,
     )
-    guesses = [] if used == stated else ["force"]
-    guesses += [f"that {listed([one.joint for one in follow])} follow"] if follow else []
+    guesses = [] if forces == stated else ["force"]
+    guesses += [f"that {listed([follower.joint for follower in follow])} follow"] if follow else []
     return config, ", ".join(guesses)
 
 
 def _finger(spec: mujoco.MjSpec, model: mujoco.MjModel, arm: ArmParts, name: str) -> _Finger:
-    """Return the ends of a joint of the gripper: it closes where it moves to the middle of all
-    fingers, or to the hand. Raises `RobotError`.
+    """Measure one joint of a gripper.
+
+    The closed end is the one nearer to the middle of all fingers, or to the hand for a single
+    finger. Raises `RobotError` for a joint without a range.
     """
     joint = model.joint(name).id
     low, high = model.jnt_range[joint]
     if not model.jnt_limited[joint]:
         raise RobotError(f"joint '{name}' of the gripper has no range")
     for actuator in spec.actuators:
-        # The set points of a servo may leave a part of the range out.
+        # The set points of a servo may cover only a part of the joint's range.
         if actuator.target == name and actuator.biastype and np.ptp(actuator.ctrlrange) > 0.0:
             low, high = np.clip(actuator.ctrlrange, low, high)
     data = mujoco.MjData(model)
@@ -119,12 +139,12 @@ def _finger(spec: mujoco.MjSpec, model: mujoco.MjModel, arm: ArmParts, name: str
     is_slide = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE
     lever = 1.0 if is_slide else max(LEAST_LEVER_M, norm(centre - data.xanchor[joint]))
     sideways = abs(inward) < SIDEWAYS * norm(motion) * norm(middle - centre)
-    if inward > 0.0:
-        return _Finger(low, high, lever, sideways)
-    return _Finger(high, low, lever, sideways)
+    ends = (low, high) if inward > 0.0 else (high, low)
+    return _Finger(*ends, lever, sideways)
 
 
 def _centre(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> Array:
+    """Compute the centre of the geoms of a body and those it carries, (3,), m."""
     geoms = geoms_of(model, below(model, np.array([body])))
     if not len(geoms):
         return np.asarray(data.xipos[body])
@@ -132,7 +152,7 @@ def _centre(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> Array:
 
 
 def _groups(model: mujoco.MjModel, arm: ArmParts) -> list[set[str]]:
-    """Return the joints of the gripper, those together that equalities tie to each other."""
+    """Group the joints of the gripper such that equalities couple all joints of a group."""
     groups = [{name} for name in arm.fingers]
     for equality in range(model.neq):
         tied = {model.joint(joint).name for joint in tied_joints(model, equality)} & {*arm.fingers}
@@ -146,12 +166,14 @@ def _groups(model: mujoco.MjModel, arm: ArmParts) -> list[set[str]]:
 def _ratio(
     model: mujoco.MjModel, leader: tuple[str, _Finger], follower: tuple[str, _Finger]
 ) -> float:
-    """Return the ratio by which a joint closes as the driven one does: as far, if it is of the
-    same kind, else in its range; 0 if it does not close.
+    """Compute the ratio between the motions of a follower and of the driven joint.
+
+    Joints of the same kind move equally far. Others are mapped from range to range. The ratio is 0
+    for a follower that does not close the fingers.
     """
-    (driven, lead), (name, own) = leader, follower
-    if own.sideways:
+    (driven, leader_finger), (name, finger) = leader, follower
+    if finger.sideways:
         return 0.0
-    ratio = (own.closed - own.open) / (lead.closed - lead.open)
+    ratio = (finger.closed - finger.open) / (leader_finger.closed - leader_finger.open)
     is_same = model.joint(driven).type == model.joint(name).type
     return float(np.sign(ratio)) if is_same else round(ratio, 5)

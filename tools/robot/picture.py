@@ -1,4 +1,4 @@
-"""A picture of an arm at home, as MuJoCo draws it: axes of the joints, the tool, contacts."""
+"""Draws an arm at home with MuJoCo, showing axes of joints, the tool and contacts."""
 
 from __future__ import annotations
 
@@ -13,12 +13,17 @@ from rack.levels.robot.cell import Cell
 WIDTH = 960
 HEIGHT = 600
 MOST_SHAPES = 5000
+"""Upper bound for the number of shapes in a picture."""
 SHOWN = (mujoco.mjtVisFlag.mjVIS_JOINT, mujoco.mjtVisFlag.mjVIS_CONTACTPOINT)
 NO_PICTURE = "no picture: it needs OpenGL (EGL); on Debian: libegl1 libgl1-mesa-dri"
 
 
 def draw(cell: Cell, path: Path) -> str:
-    """Draw the arm of a cell at home to a PNG file; return its path, or why there is none."""
+    """Draw the arm of a cell at home to a PNG file.
+
+    Returns:
+        The path as text, or `NO_PICTURE` without OpenGL.
+    """
     model = cell.model
     data = cell.start()
     model.vis.global_.offwidth = WIDTH
@@ -30,10 +35,10 @@ def draw(cell: Cell, path: Path) -> str:
 
         context = GLContext(WIDTH, HEIGHT)
         context.make_current()
-        drawn = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        renderer = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
     except (AttributeError, ImportError, RuntimeError, mujoco.FatalError):
         return NO_PICTURE
-    mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, drawn)
+    mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, renderer)
     option = mujoco.MjvOption()
     option.flags[np.array(SHOWN, dtype=int)] = True
     option.frame = mujoco.mjtFrame.mjFRAME_SITE
@@ -46,13 +51,13 @@ def draw(cell: Cell, path: Path) -> str:
     camera.azimuth = 135.0
     camera.elevation = -25.0
     scene = mujoco.MjvScene(model, MOST_SHAPES)
-    every = mujoco.mjtCatBit.mjCAT_ALL
-    mujoco.mjv_updateScene(model, data, option, None, camera, every, scene)
+    categories = mujoco.mjtCatBit.mjCAT_ALL
+    mujoco.mjv_updateScene(model, data, option, None, camera, categories, scene)
     pixels = np.zeros((HEIGHT, WIDTH, 3), dtype=np.uint8)
     window = mujoco.MjrRect(0, 0, WIDTH, HEIGHT)
-    mujoco.mjr_render(window, scene, drawn)
-    mujoco.mjr_readPixels(pixels, None, window, drawn)
-    drawn.free()
+    mujoco.mjr_render(window, scene, renderer)
+    mujoco.mjr_readPixels(pixels, None, window, renderer)
+    renderer.free()
     context.free()
     Image.fromarray(pixels[::-1]).save(path, "png")
     return str(path)

@@ -1,5 +1,7 @@
-"""Meshes of a gripper as convex pieces: MuJoCo simulates a mesh by its hull, which fills the bend
-of a jaw, and leaves no room for what one finger could take.
+"""Cuts the meshes of a gripper into convex pieces.
+
+MuJoCo simulates a mesh by its convex hull. The hull of a bent jaw fills its bend and leaves no gap
+for an object between jaw and finger.
 """
 
 from __future__ import annotations
@@ -12,39 +14,46 @@ from rack.levels.algebra import Array
 from rack.levels.robot.cell import Cell
 
 PIECE_M = 0.008
-"""Length of a piece along the jaws: across them a slice of a jaw is nearly convex."""
+"""Length of a piece along the jaws. A slice across a jaw is nearly convex."""
 DIRECTIONS = 100
-"""In which corners of a piece are sought: of thousands, those that span about the same hull."""
+"""Number of directions in which extreme points are kept. They span about the same hull as all."""
 LEAST_M = 2e-4
-"""What is thinner has no hull."""
+"""Thinner pieces are dropped, because they have no hull."""
 KEPT = ("contype", "conaffinity", "condim", "priority", "group", "solmix")
 KEPT_ROWS = ("friction", "solref", "solimp", "rgba")
-"""What a piece has of its geom."""
+"""Properties that a piece inherits from its geom."""
 
 
 def cut_meshes(spec: mujoco.MjSpec, cell: Cell, out: Array) -> int:
-    """Cut what is solid of the gripper's meshes across the way `out`, (3,), of the closed gripper
-    with the arm at its start; from then on the whole meshes are only seen. Return how many.
+    """Cut the solid meshes of a gripper into convex pieces. The whole meshes stay visible only.
+
+    Args:
+        spec: The model, which is changed.
+        cell: The same model, compiled, with its arm at the start.
+        out: Direction out of the closed hand, (3,), across which the meshes are cut.
+
+    Returns:
+        The number of pieces.
     """
     data = cell.start()
     assert cell.gripper is not None, "it has meshes"
     cell.gripper.linkage.set(data.qpos, cell.gripper.closed)
     mujoco.mj_kinematics(cell.model, data)
     count = 0
-    # With the ids of the model, which additions change.
-    for geom, number in [(geom, geom.id) for geom in spec.geoms]:
+    # Take the ids of the geoms first, because adding geoms changes them.
+    for geom, geom_id in [(geom, geom.id) for geom in spec.geoms]:
         is_solid = geom.contype or geom.conaffinity
         is_mesh = geom.type == mujoco.mjtGeom.mjGEOM_MESH
-        if not (is_solid and is_mesh and number in cell.geoms.gripper):
+        if not (is_solid and is_mesh and geom_id in cell.geoms.gripper):
             continue
-        own = data.xmat[cell.model.geom_bodyid[number]].reshape(3, 3)
-        corners, faces = _surface(cell.model, data, number)
-        for piece in _pieces(corners, faces, own.T @ out):
+        body_axes = data.xmat[cell.model.geom_bodyid[geom_id]].reshape(3, 3)
+        corners, faces = _surface(cell.model, data, geom_id)
+        for piece in _pieces(corners, faces, body_axes.T @ out):
             name = f"piece {len(spec.meshes)}"
             spec.add_mesh(name=name, uservert=piece.ravel())
             count += 1
-            kind = mujoco.mjtGeom.mjGEOM_MESH
-            added = geom.parent.add_geom(type=kind, meshname=name, mass=0.0)
+            mesh_type = mujoco.mjtGeom.mjGEOM_MESH
+            added = geom.parent.add_geom(type=mesh_type, meshname=name, mass=0.0)
             for key in KEPT:
                 setattr(added, key, getattr(geom, key))
             for key in KEPT_ROWS:
@@ -56,39 +65,43 @@ def cut_meshes(spec: mujoco.MjSpec, cell: Cell, out: Array) -> int:
 def _surface(
     model: mujoco.MjModel, data: mujoco.MjData, geom: int
 ) -> tuple[Array, NDArray[np.int32]]:
-    """Return corners (n, 3), m, in the frame of the body, and faces (m, 3) of a mesh."""
+    """Return the surface of a mesh in the frame of its body.
+
+    Returns:
+        Vertices (n, 3), m, and faces (m, 3) of vertex numbers.
+    """
     body = model.geom_bodyid[geom]
-    own = data.xmat[body].reshape(3, 3).T
-    turned = own @ data.geom_xmat[geom].reshape(3, 3)
-    middle = own @ (data.geom_xpos[geom] - data.xpos[body])
+    world_to_body = data.xmat[body].reshape(3, 3).T
+    rotation = world_to_body @ data.geom_xmat[geom].reshape(3, 3)
+    offset = world_to_body @ (data.geom_xpos[geom] - data.xpos[body])
     mesh = model.geom_dataid[geom]
     first = model.mesh_vertadr[mesh]
     corners = model.mesh_vert[first : first + model.mesh_vertnum[mesh]]
     first = model.mesh_faceadr[mesh]
     faces = model.mesh_face[first : first + model.mesh_facenum[mesh]]
-    return corners @ turned.T + middle, faces
+    return corners @ rotation.T + offset, faces
 
 
 def _pieces(corners: Array, faces: NDArray[np.int32], out: Array) -> list[Array]:
-    """Return the corners of the convex pieces of a mesh, each (n, 3), m."""
+    """Cut a mesh into slices and return the vertices of each, (n, 3), m."""
     along = corners @ out
     edges = np.vstack((faces[:, :2], faces[:, 1:], faces[:, ::2]))
 
     def crossed(place: float) -> Array:
-        """Return where edges cross a plane."""
-        one, other = edges[np.prod(along[edges] - place, axis=1) < 0.0].T
-        part = (place - along[one]) / (along[other] - along[one])
-        return np.asarray(corners[one] + part[:, None] * (corners[other] - corners[one]))
+        """Return the points at which edges cross the plane at a place along `out`."""
+        start, end = edges[np.prod(along[edges] - place, axis=1) < 0.0].T
+        fraction = (place - along[start]) / (along[end] - along[start])
+        return np.asarray(corners[start] + fraction[:, None] * (corners[end] - corners[start]))
 
-    ways = np.random.default_rng(0).normal(size=(3, DIRECTIONS))
-    found = []
+    directions = np.random.default_rng(0).normal(size=(3, DIRECTIONS))
+    pieces = []
     for low in np.arange(along.min(), along.max(), PIECE_M):
         inside = corners[(along >= low) & (along <= low + PIECE_M)]
         points = np.vstack((inside, crossed(low), crossed(low + PIECE_M)))
         if not len(points):
             continue
-        points = points[np.unique((points @ ways).argmax(axis=0))]
+        points = points[np.unique((points @ directions).argmax(axis=0))]
         sizes = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
         if len(points) > 3 and sizes[-1] > LEAST_M:
-            found.append(points)
-    return found
+            pieces.append(points)
+    return pieces

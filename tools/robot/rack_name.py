@@ -1,4 +1,4 @@
-"""The name of the rack of an arm, made of that of its model file."""
+"""Derives the name of a rack from the name of a model file."""
 
 from __future__ import annotations
 
@@ -15,7 +15,12 @@ def is_free_name(name: str, taken: Container[str]) -> bool:
 
 
 def derive_name(text: str, taken: Container[str]) -> str:
-    """Return the free name closest to a text, such as the name of a file."""
+    """Derive a valid name from a text, such as the name of a file.
+
+    Args:
+        text: Any text.
+        taken: Names in use. If the derived name is one of them, it gets the ending `-arm`.
+    """
     plain = unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode().lower()
     name = re.sub("[^a-z0-9_-]+", "-", plain).lstrip("-_")[:40].rstrip("-_") or "arm"
     return f"{name[:36]}-arm" if name in taken else name

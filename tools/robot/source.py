@@ -1,6 +1,4 @@
-"""A model from anywhere as an `MjSpec`: MJCF, or URDF by MuJoCo's own parser with its meshes
-found.
-"""
+"""Reads a model file, MJCF or URDF, as an `MjSpec`, and finds the meshes of a URDF."""
 
 from __future__ import annotations
 
@@ -18,38 +16,42 @@ from rack.levels.robot.model import compile_spec, listed, load_spec, one_line
 from rack.levels.robot.model_file import ModelReader, check_asset, find_file
 
 READ = (".stl", ".obj", ".msh")
-"""Meshes that MuJoCo reads."""
+"""Formats of meshes that MuJoCo reads."""
 COMPILER = {"strippath": "false", "fusestatic": "false", "discardvisual": "true"}
-"""Of a URDF: paths are absolute here, and a fixed frame, such as the tool's, stays a body."""
+"""Compiler settings for a URDF.
+
+Paths are absolute, and a fixed frame, such as the tool's, stays a body.
+"""
 UNBALANCED = "balanceinertia"
+"""Part of MuJoCo's error message for an impossible inertia. It names the setting that helps."""
 SLACK_S = 0.02
-"""MuJoCo's time constant of dry friction, which makes it a damper: a light link with the friction
-of a large gear, as models for position servos have it, hardly ever meets all of it."""
+"""MuJoCo's default time constant of dry friction.
+
+It makes a damper of dry friction: a light link behind a large gear hardly ever meets all of it.
+"""
 LARGE_M = 20.0
-"""Size of a part beyond which a model is probably in millimetres."""
+"""A model with larger parts than this is probably in millimetres."""
 DRY_SOLREF = (0.001, 1.0)
 DRY_SOLIMP = (0.99, 0.99)
-"""Of dry friction that is about what the equation of motion says."""
+"""Solver parameters with which dry friction nearly follows the equation of motion."""
 
 
 @dataclass
 class Source:
-    """A parsed model; everything in it has a name."""
+    """A parsed model. All of its bodies, joints and actuators have names."""
 
     path: Path
     spec: mujoco.MjSpec
     velocity: Mapping[str, float]  # rad/s, of the joints for which a URDF states it
-    notes: list[str] = field(default_factory=list)  # what was changed
+    notes: list[str] = field(default_factory=list)  # changes that were made, one sentence each
 
     def compiled(self) -> mujoco.MjModel:
-        """Return the model as it is now. Raises `RobotError`."""
+        """Compile the model in its current state. Raises `RobotError`."""
         return compile_spec(self.spec, self.path)
 
 
 def read_source(path: Path) -> Source:
-    """Return a model by its file. Raises `RobotError`, one line, where nothing can be made of
-    it.
-    """
+    """Read a model file. Raises `RobotError` with a message of one line if that is impossible."""
     root = ModelReader(path).root
     if root.tag == "mujoco":
         source = Source(path, load_spec(path), {})
@@ -57,7 +59,7 @@ def read_source(path: Path) -> Source:
         source = _urdf(path, root)
     else:
         raise RobotError(f"model '{path}': <{root.tag}>; valid: <mujoco> (MJCF), <robot> (URDF)")
-    # Name what has no name: a config names bodies, joints and actuators.
+    # A config refers to bodies, joints and actuators by name, so give a name to all of them.
     named = {
         "body": source.spec.bodies[1:],
         "joint": source.spec.joints,
@@ -66,7 +68,7 @@ def read_source(path: Path) -> Source:
     for kind, elements in named.items():
         for number, element in enumerate(elements):
             element.name = element.name or f"{kind} {number}"
-    # Make dry friction what it says, unless the model says how soon it acts.
+    # Let dry friction act at once, unless the model states a time constant.
     dry = [joint for joint in source.spec.joints if joint.frictionloss > 0.0]
     slack = [joint for joint in dry if joint.solref_friction[0] == SLACK_S]
     for joint in slack:
@@ -80,20 +82,21 @@ def read_source(path: Path) -> Source:
         if UNBALANCED not in str(error):
             raise
         source.spec.compiler.balanceinertia = True
-        source.notes.append("inertias that no body can have are balanced")
+        source.notes.append("physically impossible inertias were balanced")
         model = source.compiled()
     size = max(model.geom_rbound.max(initial=0.0), abs(model.body_pos).max())
     if size > LARGE_M:
-        source.notes.append(f"{size:.4g} m from one part to the next: is it in mm?")
+        source.notes.append(f"parts are {size:.4g} m apart: is the model in millimetres?")
     return source
 
 
 def _urdf(path: Path, root: ElementTree.Element) -> Source:
+    """Convert a URDF, fixing its planar joints. Raises `RobotError`."""
     _check_tree(path, root)
     notes = _find_shapes(path, root)
     for joint in root.findall("joint[@type='planar']"):
         joint.set("type", "fixed")
-        notes.append(f"held, as a mobile base stands: the planar joint '{joint.get('name')}'")
+        notes.append(f"planar joint '{joint.get('name')}' is fixed: a mobile base does not move")
     for extension in root.findall("mujoco"):
         root.remove(extension)
     ElementTree.SubElement(ElementTree.SubElement(root, "mujoco"), "compiler", COMPILER)
@@ -109,7 +112,7 @@ def _urdf(path: Path, root: ElementTree.Element) -> Source:
 
 
 def _check_tree(path: Path, root: ElementTree.Element) -> None:
-    """Raise `RobotError` unless all links of a URDF are declared once and hang on one root."""
+    """Raise `RobotError` unless a URDF is a tree with one root and unique names."""
     named = Counter((e.tag, e.get("name", "")) for e in root if e.tag in ("link", "joint"))
     links = [name for tag, name in named if tag == "link"]
     children = [child.get("link", "") for child in root.findall("joint/child")]
@@ -128,35 +131,36 @@ def _check_tree(path: Path, root: ElementTree.Element) -> None:
 
 
 def _find_shapes(path: Path, root: ElementTree.Element) -> list[str]:
-    """Give each link of a URDF its shapes for planning; return what to tell the user of them.
-    Raises `RobotError`.
+    """Give each link of a URDF collision shapes.
+
+    Returns notes for the user. Raises `RobotError` if no link has a shape that can be read.
     """
-    own = root.find("mujoco/compiler")
-    folder = "." if own is None else own.get("meshdir", ".")
+    compiler = root.find("mujoco/compiler")
+    folder = "." if compiler is None else compiler.get("meshdir", ".")
     links = {link.get("name", ""): link for link in root.findall("link")}
     visible = [name for name, link in links.items() if _is_only_visible(link)]
-    unread = {
+    unreadable = {
         name: problem
         for name, link in links.items()
         if (problem := _find_shape(path, link, folder)) is not None
     }
-    if unread and root.find("link/collision") is None:
-        raise next(iter(unread.values()))
-    moved = {child.get("link", "") for child in root.findall("joint/child")}
-    told = {
-        "no <collision>, so what is visible counts in planning": [
-            n for n in visible if n not in unread
+    if unreadable and root.find("link/collision") is None:
+        raise next(iter(unreadable.values()))
+    children = {child.get("link", "") for child in root.findall("joint/child")}
+    notes = {
+        "no <collision>, so planning uses the visible shapes": [
+            n for n in visible if n not in unreadable
         ],
-        "no <collision> and no mesh that can be read, so no shape in planning": [*unread],
-        "no <inertial>, so the mass is computed from the shapes, with the density of water": [
+        "no <collision> and no mesh that can be read, so no shape in planning": [*unreadable],
+        "no <inertial>, so the mass is computed from the shapes with the density of water": [
             name
             for name, link in links.items()
-            if name in moved
+            if name in children
             and link.find("collision") is not None
             and link.find("inertial") is None
         ],
     }
-    return [f"{why}: {listed(names)}" for why, names in told.items() if names]
+    return [f"{why}: {listed(names)}" for why, names in notes.items() if names]
 
 
 def _is_only_visible(link: ElementTree.Element) -> bool:
@@ -164,18 +168,18 @@ def _is_only_visible(link: ElementTree.Element) -> bool:
 
 
 def _find_shape(path: Path, link: ElementTree.Element, folder: str) -> RobotError | None:
-    """Leave in a link its collision geometry, or else what is visible as such, with its meshes.
+    """Keep the collision shapes of a link, or else turn its visible shapes into collision shapes.
 
     Args:
         path: File of the model.
         link: The link, which is changed.
-        folder: Where the model says that its meshes are.
+        folder: Folder of the meshes, as the model states it.
 
     Returns:
-        Why the link has no shape although it is visible. None if it has one, or is not.
+        The reason why a visible link has no usable shape. None if it has one or is not visible.
 
     Raises:
-        RobotError: A mesh of its collision geometry cannot be read.
+        RobotError: A mesh of its collision shapes cannot be read.
     """
     is_only_visible = _is_only_visible(link)
     visuals = link.findall("visual")
@@ -197,17 +201,17 @@ def _find_shape(path: Path, link: ElementTree.Element, folder: str) -> RobotErro
 
 
 def _mesh(path: Path, name: str, meshes: str) -> Path:
-    """Return the file of a mesh: packages are sought in all folders above the model.
+    """Find the file of a mesh. Raises `RobotError`.
 
-    In place of a mesh that MuJoCo does not read, one of the same name that it does. Raises
-    `RobotError`.
+    Packages are searched for in all folders above the model. For a mesh in a format that MuJoCo
+    does not read, a file of the same name in another format is accepted.
     """
     _, is_package, rest = name.rpartition("://")
     folder = path.resolve().parent
     within = rest.partition("/")[2]
     tried = [folder / rest, folder / meshes / Path(rest).name]
     if is_package:
-        tried += [above / part for above in folder.parents for part in (rest, within)]
+        tried += [above / relative for above in folder.parents for relative in (rest, within)]
         tried.append(folder / within)
     files = [
         file.with_suffix(suffix)
@@ -215,15 +219,15 @@ def _mesh(path: Path, name: str, meshes: str) -> Path:
         for suffix in (file.suffix, *READ)
         if suffix.lower() in READ
     ]
-    found = find_file(files)
-    if found is None:
+    mesh_file = find_file(files)
+    if mesh_file is None:
         other = find_file(tried)
         why = f"looked for as {listed([*dict.fromkeys(map(str, tried))], most=6)}"
         if other is not None:
             why = f"convert '{other}', in its folder, as Collada and the like are not read"
         raise RobotError(f"model '{path}': no mesh '{name}': {why}; valid: {', '.join(READ)}")
-    check_asset(found, path)
-    return found
+    check_asset(mesh_file, path)
+    return mesh_file
 
 
 def copy_model(source: Source, path: Path) -> None:
@@ -236,17 +240,17 @@ def copy_model(source: Source, path: Path) -> None:
     for kind, key in (("mesh", "meshdir"), ("texture", "texturedir"), ("hfield", "meshdir")):
         for element in root.iterfind(f"asset/{kind}"):
             for attribute in [name for name in element.attrib if name.startswith("file")]:
-                own = folder / compiler.get(key, "") / element.get(attribute, "")
-                if own not in names:
-                    is_taken = own.name in names.values()
-                    names[own] = f"{len(names)}-{own.name}" if is_taken else own.name
-                element.set(attribute, names[own])
+                asset = folder / compiler.get(key, "") / element.get(attribute, "")
+                if asset not in names:
+                    is_taken = asset.name in names.values()
+                    names[asset] = f"{len(names)}-{asset.name}" if is_taken else asset.name
+                element.set(attribute, names[asset])
     for key in ("meshdir", "texturedir"):
         compiler.set(key, "assets")
     assets = path.parent / "assets"
-    for own, copied in names.items():
+    for asset, copied in names.items():
         assets.mkdir(parents=True, exist_ok=True)
         if not (assets / copied).exists():
-            shutil.copyfile(own, assets / copied)
+            shutil.copyfile(asset, assets / copied)
     ElementTree.indent(root)
     path.write_text(ElementTree.tostring(root, encoding="unicode") + "\n", encoding="utf-8")

@@ -1,1 +1,1 @@
-"""A rack from Python: attached while it runs, and read back."""
+"""Access to racks from Python: running ones, launched ones and recorded ones."""

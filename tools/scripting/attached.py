@@ -1,6 +1,6 @@
-"""A running rack, for a Python program: read, commanded, disturbed, recorded.
+"""A running rack for a Python program, which can read, command, disturb and record it.
 
-Each method does what the command of its name does, by the same library.
+Each method does the same as the command of its name, by the same library.
 """
 
 from __future__ import annotations
@@ -33,18 +33,18 @@ from rack.tools.recording.recorder.process import RecorderProcess
 from rack.tools.recording.signal import Signal, Trigger, mailbox_of
 
 LOOK_S = 0.001
-"""Time between two looks at the rack."""
+"""Time between two readings of the rack."""
 
 
 def attach(rack: str) -> AttachedRack:
-    """Return the running rack of that name on this machine. Raises `Failure`."""
+    """Attach to the running rack of that name on this machine. Raises `Failure`."""
     return AttachedRack(rack)
 
 
 class AttachedRack:
     """A running rack. Use it as a context, or `close` it.
 
-    Whatever goes wrong is a `Failure` with the line that the command would print.
+    Every error is a `Failure` with the text that the command would print.
     """
 
     @as_failure()
@@ -57,7 +57,8 @@ class AttachedRack:
         self._monitor = RackMonitor(segment)
         self._alarms = AlarmWatch(segment)
         self._alarms.drain()
-        self._events: list[Event] = []  # since then, without those that were waited for
+        # Events since the rack was attached, without those that `wait_for` has returned.
+        self._events: list[Event] = []
 
     def __enter__(self) -> Self:
         return self
@@ -70,23 +71,24 @@ class AttachedRack:
         return f"<attached to rack '{self._segment.rack}': {state}>"
 
     def close(self) -> None:
-        """Leave the rack, which runs on; finish its recording."""
+        """Detach from the rack, which continues to run, and finish its recording."""
         self._closing.close()
 
     @as_failure()
     def status(self) -> Snapshot:
-        """Return the rack as it is now."""
+        """Take a snapshot of the rack."""
         return self._monitor.look()
 
     @as_failure()
     def read(self, mailbox: str) -> Reading[AnyMessage]:
-        """Return the newest message of a mailbox, a copy; it costs no board anything."""
+        """Read a copy of the newest message of a mailbox. This costs no board anything."""
         return open_observer(self._segment, mailbox_of(mailbox, self._boxes).name).peek()
 
     @as_failure()
     def __getitem__(self, name: str) -> Any:
-        """Return the newest value of a signal, as in `servo.status.position`: an array or a number;
-        a state by its name.
+        """Return the newest value of a signal, as in `servo.status.position`.
+
+        The value is an array or a number, or the name of a state.
         """
         signal = Signal.of(name, self._boxes)
         reading = self.read(signal.mailbox)
@@ -96,12 +98,24 @@ class AttachedRack:
 
     @as_failure()
     def command(self, level: str, what: str, wait_s: float | None = None, **goal: Any) -> Reply:
-        """Command a level, as in `command("servo", "setpoint", joints=(...), wait_s=10)`; return
-        its reply once it has taken the command up, with `wait_s` once it is done, in that time.
+        """Command a level, as in `command("servo", "setpoint", joints=(...), wait_s=10)`.
+
+        Args:
+            level: Name of the level.
+            what: The verb of the command.
+            wait_s: Wait until the command is done, for at most this wall-clock time. None to wait
+                only
+                until the level has taken it up.
+            goal: Further keys of a `[[command]]` table.
+
+        Returns:
+            The reply of the level.
         """
-        plain = {key: v.tolist() if isinstance(v, np.ndarray) else v for key, v in goal.items()}
-        given = {"level": level, "what": what, **plain}
-        return _accepted(self._desk.give(given, wait_s is not None, wait_s))
+        goal_values = {
+            key: v.tolist() if isinstance(v, np.ndarray) else v for key, v in goal.items()
+        }
+        request = {"level": level, "what": what, **goal_values}
+        return _accepted(self._desk.give(request, wait_s is not None, wait_s))
 
     @as_failure()
     def set(self, key: str, value: object) -> Reply:
@@ -112,7 +126,16 @@ class AttachedRack:
     def inject(self, board: str, kind: str, wait_s: float | None = None, **fields: Any) -> Document:
         """Inject a fault, as in `inject("servo", "sensor-bias", joint=2, size=0.05, lasts=0.2)`.
 
-        Return it, as the command's JSON, when it has begun; with `wait_s` when it is over.
+        Args:
+            board: Task to strike, or "clock".
+            kind: Kind of fault.
+            wait_s: Wait until the fault is over, for at most this wall-clock time. None to wait
+                only
+                until it has begun.
+            fields: Further keys of a `[[fault]]` table, with `lasts` in place of `for`.
+
+        Returns:
+            The fault, as `rack inject --json` prints it.
         """
         if "lasts" in fields:
             fields["for"] = fields.pop("lasts")
@@ -126,64 +149,82 @@ class AttachedRack:
 
     @as_failure()
     def resume(self) -> None:
-        """Let the paused rack go on."""
+        """Let the paused rack continue."""
         pausing.resume(self._segment)
 
     @as_failure()
     def estop(self, reset: bool = False) -> None:
-        """Engage the brakes from the next tick on, or let the arm move again."""
+        """Engage the brakes from the next tick on, or with `reset` let the arm move again."""
         lines = UtilityLines(self._segment)
         lines.reset_emergency_stop() if reset else lines.latch_emergency_stop()
 
     @as_failure()
     def wait_until(self, condition: str, timeout_s: float) -> int:
-        """Wait until a condition holds, as in `servo.status.position[2] > 1.2`; return the tick of
-        the first message in which it does, the newest one or a later one.
+        """Wait until a condition holds, as in `servo.status.position[2] > 1.2`.
+
+        Args:
+            condition: A comparison of a signal with a number or a state.
+            timeout_s: Longest wait, wall-clock time.
+
+        Returns:
+            Tick of the first message, the newest one or a later one, for which it holds.
         """
         trigger = Trigger.of(condition, self._boxes)
         tap = SignalTap(self._segment, [trigger.signal])
         newest = slice(-1, None)
         for _ in self._looks(timeout_s):
             for written in tap.take():
-                held = written.ticks[newest][trigger.holds(written.messages[newest])]
-                if len(held):
-                    return int(held[0])
+                holding_ticks = written.ticks[newest][trigger.holds(written.messages[newest])]
+                if len(holding_ticks):
+                    return int(holding_ticks[0])
             newest = slice(None)
         raise self._in_vain(condition, timeout_s)
 
     @as_failure()
     def wait_for(self, event: str, timeout_s: float) -> Event:
-        """Wait for an event since the rack was attached, by kind or code, as in `detection` or
-        `rejoined`; each is returned once. Those of a rack that misses many cycles are overwritten
-        if nothing waits for seconds; `Rack.events` has all.
+        """Wait for an event since the rack was attached. Each event is returned once.
+
+        Events of a rack that misses many cycles are overwritten unless they are read within
+        seconds.
+        `Rack.events` has all of them.
+
+        Args:
+            event: Kind or code, as in `detection` or `rejoined`.
+            timeout_s: Longest wait, wall-clock time.
         """
         for _ in self._looks(timeout_s):
-            self._events += [rung.event for rung in self._alarms.drain()]
-            for found in self._events:
-                if event in (found.kind, found.code):
-                    self._events.remove(found)
-                    return found
+            self._events += [alarm.event for alarm in self._alarms.drain()]
+            for seen_event in self._events:
+                if event in (seen_event.kind, seen_event.code):
+                    self._events.remove(seen_event)
+                    return seen_event
         lost = f" ({self._alarms.lost} events were overwritten)" if self._alarms.lost else ""
         raise self._in_vain(f"{event}{lost}", timeout_s)
 
     def _looks(self, timeout_s: float) -> Iterator[None]:
-        """Yield for each look at the rack, until time or run are over."""
+        """Yield at each reading of the rack, until the time or the run is over."""
         deadline = time.monotonic() + timeout_s
         is_last = False
         while not is_last:
-            # Asked before the look: what is written until the end counts.
+            # Read this before the caller reads the rack, so that it sees all up to the end.
             is_last = self._segment.run_is_over or time.monotonic() > deadline
             yield
             time.sleep(LOOK_S)
 
     def _in_vain(self, awaited: str, timeout_s: float) -> Failure:
+        """Return the failure of a wait."""
         why = "the run is over" if self._segment.run_is_over else f"not within {timeout_s:g} s"
         return Failure(f"rack '{self._segment.rack}', {awaited}: {why}")
 
     @as_failure()
     def record(self, folder: str | Path | None = None) -> Path:
-        """Record the rack, from the two seconds that its rings still hold until this is closed;
-        return the folder, by default runs/<rack>-<time>.
+        """Record the rack until it is closed, from the two seconds that its rings still hold.
+
+        Args:
+            folder: Folder of the recording. None for runs/<rack>-<time>.
+
+        Returns:
+            The folder.
         """
         wanted = None if folder is None else Path(folder)
         path = folder_of(wanted, self._segment.rack)
@@ -197,7 +238,7 @@ class AttachedRack:
 
 
 def _accepted(reply: Reply) -> Reply:
-    """Return a reply. Raises `Failure` for a refusal."""
+    """Return a reply. Raises `Failure` if the level refused the command."""
     if not reply.worked:
         raise Failure(reply.line)
     return reply

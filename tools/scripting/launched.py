@@ -1,4 +1,4 @@
-"""A rack that a Python program launches, and may record."""
+"""A rack that a Python program launches, and can record."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from rack.tools.scripting.settings import settings_of
 
 
 class LaunchedRack(CrateRack):
-    """A rack of boards, launched by a program. Use it as a context: it ends with the block.
+    """A rack launched by a program. Use it as a context: the rack ends with the block.
 
     ```python
     with Rack("nasrem", lockstep=True, settings={"clock.speed": 2}, out="run") as nasrem:
@@ -41,27 +41,27 @@ class LaunchedRack(CrateRack):
         out: str | Path | None = None,
         on_event: Callable[[Event], None] | None = None,
     ) -> None:
-        """Read the config; `launch`, or the context, starts its boards.
+        """Read the config. Entering the context, or `launch`, starts its boards.
 
         Args:
             config: A config by name or path, or a loaded one.
             lockstep: Start a tick only when every due task has finished: exact and repeatable.
-            settings: Values in place of the config's, by dotted keys or nested:
-                {"clock.speed": 2} or {"clock": {"speed": 2}}. A key that contains a dot is quoted,
-                as in TOML.
+            settings: Values in place of the config's, by dotted keys or nested: {"clock.speed": 2}
+                or
+                {"clock": {"speed": 2}}. A key that contains a dot is quoted, as in TOML.
             faults: A fault script by name or path.
-            out: Folder into which the run is recorded, as `rack run` does; it is created, and must
-                be empty. None: the run is not recorded.
-            on_event: Called with every event, as it happens.
+            out: New or empty folder into which the run is recorded, as `rack run` does. None to
+                record nothing.
+            on_event: Called with every event when it happens.
 
         Raises:
             ConfigError: The config, a setting or a fault has mistakes: all of them.
-            Failure: `out` holds files already.
+            Failure: `out` is not empty.
         """
-        wanted = [*settings_of(settings), *["clock.mode=lockstep"] * lockstep]
+        overrides = [*settings_of(settings), *["clock.mode=lockstep"] * lockstep]
         if not isinstance(config, RackConfig):
-            config = load(config, wanted, faults)
-        elif wanted or faults is not None:
+            config = load(config, overrides, faults)
+        elif overrides or faults is not None:
             raise TypeError("a loaded config takes no settings and no faults")
         super().__init__(config, self._note)
         self.folder = None if out is None else folder_of(Path(out), config.name)
@@ -74,14 +74,16 @@ class LaunchedRack(CrateRack):
         return f"<rack '{self.config.name}': {end}, {where}>"
 
     def _note(self, event: Event) -> None:
+        """Log an event, and pass it to the program."""
         if self._record is not None:
             self._record.log.add(event)
         if self._on_event is not None:
             self._on_event(event)
 
     def launch(self) -> None:
-        """Power on every board except the clock, and wait until all have passed their self-tests;
-        begin to record. Raises as `rack.boards.Rack.launch` does, and `Failure` for `out`.
+        """Start all boards except the clock, wait for their self-tests, and begin to record.
+
+        Raises the errors of `rack.boards.Rack.launch`, and `Failure` if `out` cannot be written.
         """
         if self.folder is not None:
             self._record = RunRecord(self.folder)
@@ -94,8 +96,13 @@ class LaunchedRack(CrateRack):
                 raise
 
     def watch(self, timeout_s: float) -> bool:
-        """Supervise the boards for `timeout_s` or until the run is over; return False when it is
-        over. Raises `Failure` when its recording cannot be written.
+        """Supervise the boards for `timeout_s`, or until the run is over.
+
+        Returns:
+            False if the run is over.
+
+        Raises:
+            Failure: The recording cannot be written.
         """
         is_running = super().watch(timeout_s)
         if self._record is not None:
@@ -103,7 +110,7 @@ class LaunchedRack(CrateRack):
         return is_running
 
     def close(self) -> None:
-        """End everything: no process and no segment of this rack is left; finish the recording."""
+        """End all processes of the rack, remove its segment, and finish the recording."""
         record = self._record
         if record is not None and self.outcome is not None:
             record.await_begun()
@@ -114,12 +121,13 @@ class LaunchedRack(CrateRack):
 
 
 Rack = LaunchedRack
-"""Its name in the package `rack`."""
+"""The name of the class in the package `rack`."""
 
 
 class RunRecord:
-    """The recording of a run: its events, and the recorder's process, which imports its libraries
-    while the boards start.
+    """The recording of a run: its events, and the recorder's process.
+
+    The process imports its libraries while the boards start.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -138,24 +146,27 @@ class RunRecord:
         self._began_s = time.monotonic()
 
     def look(self) -> None:
-        """Record what only the host side sees. Raises `Failure` when the recorder cannot write."""
+        """Log news of the recorder, and standstills.
+
+        Raises `Failure` if the recorder cannot write.
+        """
         for text in self._recorder.news():
             self._add(text)
         for event in () if self._standstill is None else self._standstill.look():
             self.log.add(event)
 
     def await_begun(self) -> None:
-        """Wait until the recorder has begun: later it would find no rack to attach to."""
+        """Wait until the recorder has begun, because it could not attach to a closed rack."""
         self._recorder.await_begun()
 
     def finish(self, rack: LaunchedRack) -> None:
-        """Finish the files of a rack that is closed; of a run that is over, write its outcome."""
+        """Finish the files of a closed rack, with its outcome if the run is over."""
         wall_s = time.monotonic() - self._began_s
         with closing(self.log):
             why = self._recorder.finish()
             if rack.outcome is not None:
-                found = compare_recording(self._folder, rack.segment, why, rack.outcome.ticks)
-                result = result_of(rack.segment, rack.config, rack.outcome, wall_s, *found)
+                comparison = compare_recording(self._folder, rack.segment, why, rack.outcome.ticks)
+                result = result_of(rack.segment, rack.config, rack.outcome, wall_s, *comparison)
                 self.log.end(asdict(result))
 
     def _add(self, text: str) -> None:

@@ -1,6 +1,4 @@
-"""A recorded run at a tick, for a Python program: what was in force, the levels, and a rack that
-goes on from there.
-"""
+"""A recorded run at one tick, for a Python program."""
 
 from __future__ import annotations
 
@@ -18,8 +16,9 @@ from rack.tools.recording.signal import Signal, mailbox_of
 class RecordedMoment:
     """A run before the tasks released at `tick` begin.
 
-    Whatever goes wrong is a `Failure`. For levels and racks the run is repeated up to
-    here; all else is recorded.
+    Every error is a `Failure`. Messages come from the recording. For the objects of levels, and for
+    a
+    rack that continues from this tick, the run is repeated up to it.
     """
 
     def __init__(self, recording: Recording, in_force: InForce, tick: int) -> None:
@@ -32,24 +31,25 @@ class RecordedMoment:
 
     @property
     def time_s(self) -> float:
-        """Its simulated time, s."""
+        """Simulated time of the tick, s."""
         return round(self.tick * self._recording.layout.clock_ns * 1e-9, 9)
 
     def read(self, mailbox: str) -> AnyMessage:
-        """Return the message that is in force, as a reader released now finds it."""
+        """Return the message in force, as a task released at this tick would read it."""
         content = self.row(mailbox_of(mailbox, self._recording.layout.timed).name)["message"]
         return AnyMessage(content.dtype, memoryview(bytearray(content.tobytes())))
 
     def row(self, mailbox: str) -> Any:
-        """Return the same with its head, as a row of the mailbox's ring. Raises `Failure`."""
+        """Return the message in force with its header, as a row of the ring. Raises `Failure`."""
         row = self._in_force.row(mailbox, self.tick)
         if row is None:
             raise Failure(f"{mailbox}: no message yet at {self.time_s:g} s", 2)
         return row
 
     def __getitem__(self, name: str) -> Any:
-        """Return the value of a signal, as in `servo.status.position`: an array or a number; a
-        state by its name.
+        """Return the value of a signal, as in `servo.status.position`.
+
+        The value is an array or a number, or the name of a state.
         """
         signal = Signal.of(name, self._recording.layout.timed)
         return signal.in_message(self.read(signal.mailbox).record)
@@ -57,16 +57,18 @@ class RecordedMoment:
     @property
     def mailboxes(self) -> dict[str, AnyMessage]:
         """The messages in force, by mailbox."""
-        found = (box.name for box in self._recording.layout.timed)
+        names = (box.name for box in self._recording.layout.timed)
         return {
             name: self.read(name)
-            for name in found
+            for name in names
             if self._in_force.row(name, self.tick) is not None
         }
 
     def levels(self, anyway: bool = False) -> dict[str, Document]:
-        """Return the attributes of the levels' own objects, by task, in plain data; `anyway`: even
-        if the code or the files of the run have changed since.
+        """Return the attributes of the levels' objects as plain data, by task.
+
+        Args:
+            anyway: True to repeat the run even if its code or files have changed since.
         """
         with as_failure(), RunAgain(self._recording, anyway=anyway) as again:
             return again.levels(self.tick)
@@ -78,11 +80,14 @@ class RecordedMoment:
         seconds: float | None = None,
         anyway: bool = False,
     ) -> Rack:
-        """Return a rack in the background that goes on from here in lockstep; with `settings`, as
-        in "board.servo.params.bandwidth=80", or `faults` it is a branch.
+        """Continue the run in the background, in lockstep. Close the rack, or use it as a context.
 
-        Close it, or use it as a context. `seconds` counts from the beginning of the recorded run;
-        `anyway` is as in `levels`.
+        Args:
+            settings: Changed values, as in "board.servo.params.bandwidth=80", which make it a
+                branch.
+            faults: A fault script by name or path, which makes it a branch as well.
+            seconds: Simulated time from the beginning of the recorded run. None to run to the end.
+            anyway: True to repeat the run even if its code or files have changed since.
         """
         with as_failure():
             config = branched(self._recording, settings, faults)

@@ -1,4 +1,4 @@
-"""A recorded run, for a Python program: signals as arrays, as tables of pandas, as curves."""
+"""A recorded run for a Python program: its signals as arrays, as pandas tables and as curves."""
 
 from __future__ import annotations
 
@@ -24,24 +24,29 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 MOST_NAMED = 12
-"""Most curves and marks of one plot that its legend names."""
+"""Largest number of curves and marks that the legend of a plot lists."""
 
 
 def open_run(folder: str | Path) -> RecordedRun:
-    """Return the run in a folder. Raises `Failure`."""
+    """Open the run in a folder. Raises `Failure`."""
     return RecordedRun(Path(folder))
 
 
 class RecordedRun:
-    """What `rack run` or `rack record` left in a folder."""
+    """A run that `rack run` or `rack record` has recorded.
+
+    Attributes:
+        folder: Folder of the run.
+        signals: Every field of every mailbox, by name. A number of a field can be looked up as
+            well, as
+            in `servo.status.position[2]`.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._recording = Recording(folder)
         self._in_force = InForce(self._recording)
         self.signals = RecordedSignals(self._recording)
-        """Every field of every mailbox; also found is a number of one, as in
-        `servo.status.position[2]`."""
 
     def __repr__(self) -> str:
         end = self._recording.ended.get("outcome", {}).get("cause", "no outcome")
@@ -49,20 +54,18 @@ class RecordedRun:
         return f"<run {self.folder} of rack '{rack}': {end}, {len(self.signals)} signals>"
 
     def at(self, time_s: float) -> RecordedMoment:
-        """Return the run at a simulated time, s. Raises `Failure` for one outside."""
+        """Return the run at a simulated time, s. Raises `Failure` for a time outside the run."""
         tick = tick_in(self._recording, str(time_s))
         return RecordedMoment(self._recording, self._in_force, tick)
 
     @cached_property
     def events(self) -> list[Event]:
-        """What happened, oldest first; none in a recording by `rack record`."""
+        """Events of the run, oldest first. Empty in a recording by `rack record`."""
         return _events(self._recording)
 
     @cached_property
     def report(self) -> Document:
-        """The report, as in report.json, which is written if it is missing or older than the
-        run.
-        """
+        """The content of report.json, which is updated if it is missing or older than the run."""
         return newest_report(self.folder)[0]
 
     def to_pandas(self, mailbox: str) -> DataFrame:
@@ -72,7 +75,7 @@ class RecordedRun:
 
 
 class RecordedSignals(dict[str, "RecordedSignal"]):
-    """The signals of a run by name. Raises `Failure` with the nearest names for an unknown one."""
+    """The signals of a run by name. An unknown name raises `Failure` with the nearest names."""
 
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
@@ -92,9 +95,9 @@ class RecordedSignal:
     """A signal of a run, read on first use.
 
     Attributes:
-        name: Its name, as in `servo.status.position[2]`.
-        unit: Its unit; empty for counts, names and text.
-        meaning: What its field says.
+        name: Name of the signal, as in `servo.status.position[2]`.
+        unit: Unit. Empty for counts, names and text.
+        meaning: Meaning of the field.
         shape: Shape of its value in one message.
     """
 
@@ -107,42 +110,45 @@ class RecordedSignal:
         self.shape = signal.shape[len(signal.index) :]
 
     def __repr__(self) -> str:
-        what = [self.unit] * bool(self.unit) + [f"shape {self.shape}"] * bool(self.shape)
-        return f"<signal {', '.join([self.name, *what])}: {self.meaning}>"
+        properties = [self.unit] * bool(self.unit) + [f"shape {self.shape}"] * bool(self.shape)
+        return f"<signal {', '.join([self.name, *properties])}: {self.meaning}>"
 
     @cached_property
     def values(self) -> np.ndarray:
-        """Its value in every message, (messages, *shape), in `unit`; states are numbers."""
+        """Values in all messages, (messages, *shape), in `unit`. States are numbers."""
         signal = self.signal
         return signal.part(self._recording.signal(signal.mailbox, signal.label))
 
     @cached_property
     def ticks(self) -> np.ndarray:
-        """The ticks at which the messages were released, (messages,)."""
+        """Ticks at which the messages were released, (messages,)."""
         return self._recording.signal(self.signal.mailbox, "tick")
 
     @property
     def time_s(self) -> np.ndarray:
-        """The same as simulated time, (messages,), s."""
+        """Simulated times at which the messages were released, (messages,), s."""
         return self.ticks * (self._recording.layout.clock_ns * 1e-9)
 
     def to_pandas(self) -> DataFrame:
-        """Return a table with a row a message, by time_s: the tick, and a column a number; states
-        by name. Raises `Failure` without pandas.
+        """Return a table with a row for each message, indexed by time_s.
+
+        It has the tick, and a column for each number. States are given by name. Raises `Failure`
+        without
+        pandas.
         """
         return _table([self])
 
     def plot(self, axes: Axes | None = None) -> Axes:
-        """Draw its numbers over simulated time, and mark where faults began and processes died.
+        """Plot the signal over simulated time, with marks at the beginning of faults and at deaths.
 
         Args:
-            axes: Axes of matplotlib to draw on; by default those of a new figure.
+            axes: Axes of matplotlib to draw on. None for those of a new figure.
 
         Raises:
-            Failure: It is text, or matplotlib is missing.
+            Failure: The signal is a text, or matplotlib is missing.
         """
         if self.signal.is_text:
-            raise Failure(f"{self.name}: text; a plot needs numbers", 2)
+            raise Failure(f"{self.name}: is a text; only numbers can be plotted", 2)
         if not can_draw():
             raise Failure(NO_PICTURES)
         from matplotlib import pyplot
@@ -166,7 +172,10 @@ class RecordedSignal:
         return axes
 
     def _marks(self) -> dict[int, str]:
-        """Return what a plot marks, by tick; a process that died in place of what killed it."""
+        """Return the texts that a plot marks, by tick.
+
+        A death replaces the fault at the same tick.
+        """
         marks: dict[int, str] = {}
         for event in _events(self._recording):
             if event.kind == "fault" and event.code == "begins":
@@ -177,22 +186,24 @@ class RecordedSignal:
 
 
 def _events(recording: Recording) -> list[Event]:
+    """Return the events of a run, without its outcome."""
     return [Event(**event) for event in recording.events if event["kind"] != "outcome"]
 
 
 def _place(index: Sequence[int]) -> str:
+    """Format an index, as in `[2][0]`."""
     return "".join(f"[{number}]" for number in index)
 
 
 def _table(signals: Sequence[RecordedSignal]) -> DataFrame:
-    """Return the signals of one mailbox as a table."""
+    """Return the signals of one mailbox as a table. Raises `Failure` without pandas."""
     try:
         from pandas import DataFrame, Index
     except ImportError:
         raise Failure("tables need pandas: pip install 'nasrem-rack[notebook]'") from None
     columns = {"tick": signals[0].ticks}
-    for one in signals:
-        values = one.signal.named(one.values)
+    for signal in signals:
+        values = signal.signal.named(signal.values)
         for index in np.ndindex(values.shape[1:]):
-            columns[f"{one.name}{_place(index)}"] = values[(slice(None), *index)]
+            columns[f"{signal.name}{_place(index)}"] = values[(slice(None), *index)]
     return DataFrame(columns, index=Index(signals[0].time_s, name="time_s"))

@@ -1,8 +1,8 @@
-"""A recorded run that one goes through tick by tick: where one is, what is there, and branches.
+"""Navigation through a recorded run, tick by tick, with branches.
 
-`rack rewind` is the prompt to it. What is shown at a tick is what the tasks released then find,
-before they begin: the messages in force, which the recording has, and the objects of the levels,
-read in copies of their processes, of which the rack that runs again leaves some on the way.
+`rack rewind` is the prompt for it. A tick is shown as the tasks released at it are about to find
+it. Messages come from the recording. Objects of levels are read in copies of their processes:
+snapshots that a repeated run of the rack leaves.
 """
 
 from __future__ import annotations
@@ -34,15 +34,16 @@ from rack.tools.scripting.moment import RecordedMoment
 
 @dataclass(frozen=True)
 class Glance:
-    """What a step of going through a run found: for programs, and as lines for people."""
+    """The answer to one step of the navigation, as plain data and as lines for people."""
 
     document: Document
     lines: Iterable[str]
 
 
 class RewoundRun:
-    """A run, and the `tick` at which one looks at it. Use it as a context: it repeats the run, and
-    keeps snapshots of it.
+    """A recorded run and the current `tick`.
+
+    Use it as a context, which repeats the run in the background and keeps snapshots of it.
     """
 
     def __init__(self, folder: Path, anyway: bool = False) -> None:
@@ -59,8 +60,8 @@ class RewoundRun:
         self._again: RunAgain | None = None
 
     def __enter__(self) -> Self:
-        # Its crate imports while the user types. What keeps a run from being repeated is said when
-        # that is asked for.
+        # Start the crate early, so that it imports while the user types. If the run cannot be
+        # repeated, the user is told when a command needs that.
         with suppress(Failure):
             self._ready()
         return self
@@ -70,35 +71,36 @@ class RewoundRun:
             self._again.crate.end()
 
     def _ready(self) -> RunAgain:
-        """Return the run that is repeated; anew after its crate was lost."""
+        """Return the repeated run, which is started again if its crate was lost."""
         if self._again is None or self._again.crate.is_over:
             self._again = RunAgain(self.recording, anyway=self._anyway)
         return self._again
 
     @property
     def names(self) -> list[str]:
-        """What can be shown: levels, mailboxes and signals."""
+        """Names that can be shown: tasks, mailboxes and signals."""
         return [*self._tasks, *self._boxes, *self._signals]
 
     def time_s(self, tick: int) -> float:
-        """Return the simulated time of a tick, s."""
+        """Convert a tick to simulated time, s."""
         return round(tick * self._layout.clock_ns * 1e-9, 9)
 
     def goto(self, time_s: str) -> Glance:
-        """Go to a simulated time, s. Raises `Failure` for one that is not recorded."""
+        """Go to a simulated time, s. Raises `Failure` if it was not recorded."""
         return self._go(tick_in(self.recording, time_s))
 
     def step(self, ticks: int) -> Glance:
-        """Go so many ticks on, or back."""
+        """Go forward by some ticks, or back if the number is negative."""
         return self._go(tick_in(self.recording, str(self.time_s(self.tick + ticks))))
 
     def goto_when(self, condition: str, back: bool = False) -> Glance:
-        """Go to the next tick at which readers find that a condition has begun to hold, or to the
-        one before. Raises `Failure` where there is none.
+        """Go to the next tick at which a condition begins to hold, or back to the previous one.
+
+        Raises `Failure` if there is no such tick.
         """
-        found = self._in_force.begins(Trigger.of(condition, self._layout.timed))
-        before = found[(found >= self._first) & (found < self.tick)][-1:]
-        after = found[(found > self.tick) & (found < self._end)][:1]
+        begin_ticks = self._in_force.begins(Trigger.of(condition, self._layout.timed))
+        before = begin_ticks[(begin_ticks >= self._first) & (begin_ticks < self.tick)][-1:]
+        after = begin_ticks[(begin_ticks > self.tick) & (begin_ticks < self._end)][:1]
         for tick in before if back else after:
             return self._go(int(tick))
         where = "before" if back else "after"
@@ -117,8 +119,9 @@ class RewoundRun:
         return Glance({"tick": tick, "time_s": self.time_s(tick)}, [self._now])
 
     def show(self, name: str) -> Glance:
-        """Return a level's own attributes, the message in force in a mailbox, or a signal in it.
-        Raises `Failure` with the nearest names.
+        """Show the attributes of a level, the message in force in a mailbox, or a signal.
+
+        Raises `Failure` with the nearest names for an unknown one.
         """
         whole = name.partition("[")[0]
         if name in self._tasks:
@@ -129,10 +132,16 @@ class RewoundRun:
             signal = Signal.of(name, self._layout.timed)
             value = signal.plain(self._moment.row(signal.mailbox)["message"][None])[0]
             return self._shown(name, value, [f"{name} = {cell(value)} {signal.unit}".rstrip()])
-        near = get_close_matches(whole, self.names, NEAREST) or [*self._tasks, *self._boxes]
-        raise Failure(f"{name}: no such level, mailbox or signal; nearest: {', '.join(near)}", 2)
+        nearest_names = get_close_matches(whole, self.names, NEAREST) or [
+            *self._tasks,
+            *self._boxes,
+        ]
+        raise Failure(
+            f"{name}: no such level, mailbox or signal; nearest: {', '.join(nearest_names)}", 2
+        )
 
     def _shown(self, name: str, value: Any, lines: Iterable[str]) -> Glance:
+        """Build the answer of `show_name`."""
         where = {"tick": self.tick, "time_s": self.time_s(self.tick)}
         return Glance({**where, "name": name, "value": value}, lines)
 
@@ -142,6 +151,7 @@ class RewoundRun:
         return self._shown(mailbox, document, text.lines(document))
 
     def _level(self, task: str) -> Glance:
+        """Show the attributes of a level. They are read once for each tick."""
         tick, levels = self._levels
         if tick != self.tick:
             with as_failure():
@@ -151,13 +161,16 @@ class RewoundRun:
         return self._shown(task, levels[task], fitted(("attribute", "value"), rows))
 
     def events(self, around_s: float) -> Glance:
-        """Return the events at most so long before and after this tick."""
+        """Show the events within a time before and after this tick."""
         span = around_s * 1e9 / self._layout.clock_ns
         events = (event for event in self.recording.events if event.get("tick", -1) >= 0)
-        found = [event for event in events if abs(event["tick"] - self.tick) <= span]
-        lines = [f"{self.time_s(one['tick']):g} s  {event_text(Event(**one))}" for one in found]
+        nearby_events = [event for event in events if abs(event["tick"] - self.tick) <= span]
+        lines = [
+            f"{self.time_s(near['tick']):g} s  {event_text(Event(**near))}"
+            for near in nearby_events
+        ]
         nothing = f"no events within {around_s:g} s of {self._now}"
-        return Glance({"tick": self.tick, "events": found}, lines or [nothing])
+        return Glance({"tick": self.tick, "events": nearby_events}, lines or [nothing])
 
     def branch(
         self,
@@ -167,34 +180,46 @@ class RewoundRun:
         seconds: float | None,
         display: Display,
     ) -> Glance:
-        """Let the rack go on from this tick, with other settings or faults, and record it; as long
-        as the run where that was given a time. Raises `Failure`, `ConfigError`.
+        """Run the rack from this tick with other settings or faults, and record that.
+
+        Args:
+            settings: Changed values, as KEY=VALUE.
+            faults: A fault script by name or path, or None.
+            out: Folder of the branch. None for runs/<rack>-<time>.
+            seconds: Simulated time from the beginning of the recorded run. None for the duration of
+                that
+                run if it was limited, otherwise until the task ends.
+            display: Shows the branch while it runs.
+
+        Raises:
+            ConfigError: The changed config has mistakes.
+            Failure: The run cannot be repeated, or the branch cannot be recorded.
         """
         config = branched(self.recording, settings, faults)
-        ended = self.recording.ended.get("outcome", {})
-        if seconds is None and ended.get("cause") == "time over":
+        outcome = self.recording.ended.get("outcome", {})
+        if seconds is None and outcome.get("cause") == "time over":
             seconds = self.time_s(self._end)
         folder = folder_of(out, config.name)
         begins = self._ready().beginning(self.tick)
         result = run_rack(config, seconds, folder, display, begins=begins)
         report, _ = write_report(folder)
-        differs = first_difference(self.recording, Recording(folder))
-        where = "all that both wrote is equal"
-        if differs is not None:
-            at = f"{self.time_s(differs.tick):g} s, tick {differs.tick}"
-            where = f"differs from {self.recording.folder} first at {at}, in {differs.mailbox}"
+        difference = first_difference(self.recording, Recording(folder))
+        where = "all messages that both runs wrote are equal"
+        if difference is not None:
+            place = f"{self.time_s(difference.tick):g} s, tick {difference.tick}, in"
+            where = f"differs from {self.recording.folder} first at {place} {difference.mailbox}"
         document = {
             "folder": str(folder),
             "tick": self.tick,
             "outcome": asdict(result.outcome),
-            "first_difference": None if differs is None else asdict(differs),
+            "first_difference": None if difference is None else asdict(difference),
         }
         return Glance(document, [*summary(report), where, f"recorded into {folder}"])
 
 
-def _flat(found: Mapping[str, Any], outer: str = "") -> Iterable[tuple[str, Any]]:
-    """Yield attributes with those of objects in them, by dotted names."""
-    for name, value in found.items():
+def _flat(attributes: Mapping[str, Any], outer: str = "") -> Iterable[tuple[str, Any]]:
+    """Yield attributes by dotted names, including the attributes of nested objects."""
+    for name, value in attributes.items():
         if isinstance(value, dict):
             yield from _flat(value, f"{outer}{name}.")
         else:

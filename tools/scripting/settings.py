@@ -1,4 +1,4 @@
-"""Settings as values of Python, for a rack that a program launches."""
+"""Converts settings in Python values to the form of `--set`, for a rack that a program launches."""
 
 from __future__ import annotations
 
@@ -13,10 +13,14 @@ from rack.boards.errors import ConfigError, Mistake
 
 
 def settings_of(tables: Mapping[str, Any], outer: str = "") -> Iterator[str]:
-    """Yield the settings in tables of Python values, whose keys may be dotted, as --set takes them.
+    """Yield the settings in tables of Python values, in the form that --set takes.
+
+    Args:
+        tables: Values by key. Keys may be dotted, and values may be tables.
+        outer: Dotted beginning of all keys.
 
     Raises:
-        ConfigError: A value is none of TOML.
+        ConfigError: TOML cannot express a value.
     """
     for key, value in tables.items():
         if isinstance(value, Mapping) and value:
@@ -29,7 +33,7 @@ def settings_of(tables: Mapping[str, Any], outer: str = "") -> Iterator[str]:
 
 
 def _inline(value: Any) -> str:
-    """Return a Python value as TOML on one line; an array of numpy as a list, a path as text."""
+    """Format a Python value as TOML on one line. Numpy arrays become lists, and paths texts."""
     if isinstance(value, Mapping):
         items = (f"{_inline(str(key))} = {_inline(item)}" for key, item in value.items())
         return f"{{{', '.join(items)}}}"

@@ -1,4 +1,4 @@
-"""Stand-in for an arm with drives: starts one process per drive, and restarts those that died.
+"""Stand-in for an arm with drives: starts one process for each drive, and restarts dead ones.
 
 For your drives, remove `[host.drives]` from the config.
 """

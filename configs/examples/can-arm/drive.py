@@ -140,7 +140,14 @@ class Drive:
 
 
 def run_drive(node: int, mechanics: Mechanics, times_s: tuple[float, float], parent: int) -> None:
-    """Run a drive in this process until it is reset or the parent process ends."""
+    """Run a drive in this process until it is reset or the parent process ends.
+
+    Args:
+        node: Node of the drive on the bus.
+        mechanics: Mechanics of the arm, in shared memory.
+        times_s: As in `Drive`.
+        parent: Process id of the parent.
+    """
     die_with_parent(parent)
     name_process(f"drive {node}")
     set_priority(PRIORITY)

@@ -21,7 +21,7 @@ from rack.levels.robot.dynamics import Dynamics
 STEP_S = 1e-3
 ROWS = 4
 LEAD_S = 5e-3
-"""Longest extrapolation of another joint: a joint whose drive has died stops there."""
+"""Longest extrapolation of another joint, after which a joint without a drive stops."""
 
 
 class Mechanics:

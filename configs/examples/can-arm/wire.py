@@ -101,8 +101,10 @@ class Frame(NamedTuple):
 
 
 def open_bus() -> can.BusABC:
-    """Open the bus that the environment names, as python-can reads it (CAN_INTERFACE, CAN_CHANNEL);
-    by default `LOCAL`. Raises `LevelError`."""
+    """Open the bus that the environment names (CAN_INTERFACE, CAN_CHANNEL), by default `LOCAL`.
+
+    Raises `LevelError`.
+    """
     settings = {**LOCAL, **can.util.load_environment_config()}
     try:
         return can.Bus(**settings, fd=True, ignore_config=True)
@@ -112,7 +114,14 @@ def open_bus() -> can.BusABC:
 
 
 def send(bus: can.BusABC, kind: int, node: int, data: bytes) -> None:
-    """Send a frame without blocking. A frame that the bus rejects is lost."""
+    """Send a frame without blocking. A frame that the bus rejects is lost.
+
+    Args:
+        bus: The bus.
+        kind: First identifier of this kind of frame, to which the node is added.
+        node: Node that sends the frame, or that it is for.
+        data: Content. More than 8 bytes need CAN FD.
+    """
     is_fd = len(data) > 8
     with suppress(can.CanError):
         bus.send(can.Message(0.0, kind + node, False, data=data, is_fd=is_fd), 0)

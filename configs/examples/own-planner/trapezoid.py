@@ -90,8 +90,16 @@ class TrapezoidPlanner(Planner):
         return [*sections, (start_s, path.length, 0.0, 0.0, 0.0)]
 
     def find_limits(self, path: BlendedPath, first: float, last: float) -> tuple[float, float]:
-        """Return the largest speed, rad/s, and acceleration, rad/s2, of the path parameter that all
-        joints permit between two path parameters."""
+        """Compute the limits of the path parameter that all joints permit on a part of the path.
+
+        Args:
+            path: Path of the segment.
+            first: Path parameter at the beginning of the part, rad.
+            last: Path parameter at its end, rad.
+
+        Returns:
+            Largest speed, rad/s, and acceleration, rad/s2.
+        """
         speeds = []
         accelerations = []
         for s in np.linspace(first, last, 2 + int((last - first) / SAMPLE_RAD)):

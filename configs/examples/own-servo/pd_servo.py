@@ -1,4 +1,4 @@
-"""A servo law of one's own: PD control with gravity compensation, in place of computed torque."""
+"""A servo law in place of computed torque: PD control with gravity compensation."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from rack.levels.tables import Positive
 
 
 class Gains(LawParams):
-    """What `[board.servo.params]` may hold, besides what any servo law has."""
+    """Additional keys of `[board.servo.params]`."""
 
     stiffness: Positive = 1600.0
     """acceleration for an error of one rad, 1/s2"""
@@ -17,7 +17,7 @@ class Gains(LawParams):
 
 
 class PdServo(ServoLaw):
-    """Drives every joint by itself; gains are scaled by the inertia of each joint."""
+    """Controls every joint independently. Gains are scaled by the inertia of each joint."""
 
     params = Gains
     settings: Gains

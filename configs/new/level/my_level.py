@@ -1,6 +1,6 @@
-"""A level of your own: what it reads, what it writes, and what it does in every cycle.
+"""A level to start from: its inputs, its outputs, and one method that runs every cycle.
 
-`rack.levels.level` says what a level must do, and what it may.
+`rack.levels.level` documents what a level must do, and what it may do.
 """
 
 from __future__ import annotations
@@ -11,20 +11,20 @@ from rack.levels.messages import ServoStatus
 
 
 class MyLevelParams(Table):
-    """What `[board.my_level.params]` may hold."""
+    """Keys of `[board.my_level.params]`."""
 
     limit: Live[Positive] = 2.0
     """speed of a joint from which it is reported [rad/s]"""
 
 
 class MyLevelStatus(AnsweringStatus, version=1):
-    """What the level writes in every cycle. The version rises when the fields change."""
+    """Message that the level writes in every cycle. Raise its version when the fields change."""
 
     speed: float = field(unit="rad/s", doc="speed of the fastest joint")
 
 
 class MyLevel(Executor):
-    """Watches how fast the joints move."""
+    """Watches the speed of the joints."""
 
     servo = Input(ServoStatus, "servo.status")
     status = Output(MyLevelStatus)
@@ -33,7 +33,7 @@ class MyLevel(Executor):
     settings: MyLevelParams
 
     def process(self, tick: int) -> None:
-        """Do one cycle: read the inputs, fill the outputs."""
+        """Run one cycle: read the inputs, and fill the outputs."""
         status = self.status
         status.state = State.EXECUTING
         status.speed = float(abs(self.servo.message.velocity).max())

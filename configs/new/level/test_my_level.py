@@ -1,4 +1,4 @@
-"""The level with all others in one process, without boards."""
+"""Tests the level together with all other levels in one process, without boards."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""A planner of your own, in the background of a level: what takes too long for a cycle.
+"""A planner to start from. It runs in the background of a level, and may take longer than a cycle.
 
-The executor reads the newest plan in every cycle; `within_cycles` cycles after it was begun, a plan
-takes effect. `rack.levels.level` says what else a level must do.
+The executor reads the newest plan in every cycle. A plan takes effect `within_cycles` cycles after
+it was begun. `rack.levels.level` documents what else a level must do.
 """
 
 from __future__ import annotations
@@ -16,26 +16,26 @@ from rack.levels.robot.dynamics import Dynamics
 
 
 class MyPlannerPlan(Message, version=1):
-    """What the planner tells the executor. The version rises when the fields change."""
+    """Message from the planner to the executor. Raise its version when the fields change."""
 
     gravity: np.ndarray = field(unit="N m", shape="joints", doc="torques that hold the arm still")
 
 
 class MyPlannerStatus(Status, version=1):
-    """What the level writes in every cycle."""
+    """Message that the level writes in every cycle."""
 
     moving: float = field(unit="N m", doc="largest torque that is spent on motion")
 
 
 class MyPlannerLevel(Executor):
-    """Shows which part of the torques moves the arm, and does not only hold it."""
+    """Shows how much torque moves the arm, in addition to the torque that holds it."""
 
     servo = Input(ServoStatus, "servo.status")
     plan = Input(MyPlannerPlan, "own.plan")
     status = Output(MyPlannerStatus)
 
     def process(self, tick: int) -> None:
-        """Do one cycle: read the inputs and the newest plan, fill the outputs."""
+        """Run one cycle: read the inputs and the newest plan, and fill the outputs."""
         self.status.state = State.EXECUTING
         if self.plan.is_there:
             spent = self.servo.message.torque - self.plan.message.gravity
@@ -55,10 +55,10 @@ class MyPlanner(Planner):
         self.rest = np.zeros(len(cell.home))  # (joints,), rad/s
 
     def wanted(self, tick: int) -> bool:
-        """Return whether there is something new to plan from; the default asks the port `above`."""
+        """Return whether there is new input to plan from. By default this asks the port `above`."""
         return self.servo.is_new
 
     def plan(self, tick: int) -> None:
-        """Make one plan."""
+        """Compute one plan."""
         position = self.servo.message.position
         self.output.gravity[:] = self.dynamics.terms(position, self.rest).bias

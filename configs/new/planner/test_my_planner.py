@@ -1,4 +1,4 @@
-"""Executor and planner with all other levels in one process, without boards."""
+"""Tests executor and planner together with all other levels in one process, without boards."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""A servo law of your own: one method. All else of a servo level is inherited.
+"""A servo law to start from: one method. The rest of the servo level is inherited.
 
-`rack.levels.servo.ServoLaw` says what that is.
+`rack.levels.servo.ServoLaw` documents what that is.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from rack.levels.servo import LawParams, Motion, SensedMotion, ServoLaw
 
 
 class MyServoParams(LawParams):
-    """What `[board.servo.params]` may hold, besides what any servo law has."""
+    """Additional keys of `[board.servo.params]`."""
 
     stiffness: Live[Positive] = 2500.0
     """acceleration for an error of one rad, 1/s2"""
@@ -20,7 +20,7 @@ class MyServoParams(LawParams):
 
 
 class MyServo(ServoLaw):
-    """Drives every joint by itself: PD control, and compensation of gravity."""
+    """Controls every joint independently: PD control with gravity compensation."""
 
     params = MyServoParams
     settings: MyServoParams

@@ -1,4 +1,4 @@
-"""The law with all levels in one process, without boards."""
+"""Tests the servo law together with all levels in one process, without boards."""
 
 from __future__ import annotations
 

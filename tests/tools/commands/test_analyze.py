@@ -1,4 +1,4 @@
-"""`rack analyze`: a run against the timing model, as a user sees it."""
+"""Tests `rack analyze`: a run compared with the timing model, as a user sees it."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ USUAL = ["--percentile", "50"]
 
 
 def verdicts(found: dict[str, Any], side: str) -> dict[tuple[str, str], bool]:
-    """Return which equations hold on which subjects, on one side of the document."""
+    """Return the verdict of each equation and subject, on one side of the document."""
     return {
         (row["equation"], row["subject"]): row[side]["holds"]
         for row in found["equations"]
@@ -44,7 +44,7 @@ JUDGED = {("3.1", "level"), ("3.6", "level"), ("response time", "level"), ("load
 @pytest.mark.slow
 @pytest.mark.alone
 @pytest.mark.parametrize(("figure", "holds"), [("fig4", True), ("fig4-overload", False)])
-def test_what_is_predicted_of_a_rack_is_seen_in_its_run(
+def test_a_run_confirms_the_prediction_for_its_rack(
     rack_name: str, tmp_path: Path, figure: str, holds: bool
 ) -> None:
     run_rack(load(figure, [f"name={rack_name}"]), 1.5, tmp_path / "run", Display())
@@ -72,7 +72,7 @@ def test_what_is_predicted_of_a_rack_is_seen_in_its_run(
         ({"cause": "time over", "faults": ["emergency stop"]}, 0, "rack report {}"),
     ],
 )
-def test_what_matters_comes_first_and_the_tables_on_demand(
+def test_the_verdict_comes_first_and_tables_only_on_demand(
     small: Path, tmp_path: Path, outcome: dict[str, Any], missed: int, to_do: str
 ) -> None:
     config = load(small, ["clock.mode=realtime", *BUDGET])
@@ -95,7 +95,9 @@ def test_what_matters_comes_first_and_the_tables_on_demand(
     assert [any("Equations: " in line for line in lines) for lines in (found, more)] == [0, 1]
 
 
-def test_predicted_and_measured_that_differ_are_marked(small: Path, tmp_path: Path) -> None:
+def test_differences_between_prediction_and_measurement_are_marked(
+    small: Path, tmp_path: Path
+) -> None:
     config = load(small, ["clock.mode=realtime", *BUDGET])
     trace = [
         Cycle(SETTLED + k, (0.0, 0.1, 2.6 if k == 7 else 1.0, 0.1), flags=int(k == 7))
@@ -114,9 +116,7 @@ def test_predicted_and_measured_that_differ_are_marked(small: Path, tmp_path: Pa
     assert "never ran: upper\nmade no plan: lower\n" in found
 
 
-def test_a_stall_that_is_rare_fails_the_worst_cycle_and_not_most(
-    small: Path, tmp_path: Path
-) -> None:
+def test_a_rare_stall_fails_only_the_worst_cycle(small: Path, tmp_path: Path) -> None:
     config = load(small, ["clock.mode=realtime", *BUDGET])
     trace = [Cycle(SETTLED + k, (0.0, 0.1, 2.6 if k == 7 else 1.0, 0.1)) for k in range(400)]
     recording = recorded(tmp_path / "run", config, {"lower": trace})
@@ -154,7 +154,7 @@ def test_a_stall_that_is_rare_fails_the_worst_cycle_and_not_most(
         (Cycle(SETTLED + 8, PLAIN, late=9.0), "lockstep", {}),
     ],
 )
-def test_the_equations_are_put_to_the_worst_cycle(
+def test_the_equations_are_applied_to_the_worst_cycle(
     small: Path, tmp_path: Path, last: Cycle, mode: str, broken: dict[str, tuple[float, float]]
 ) -> None:
     config = load(small, [f"clock.mode={mode}", "timing.context_switch_ms=0.1"])
@@ -168,7 +168,7 @@ def test_the_equations_are_put_to_the_worst_cycle(
     assert found == {name: pytest.approx(sides, abs=1e-6) for name, sides in broken.items()}
 
 
-def test_a_level_that_is_late_though_its_times_fit_is_not_referred_to_the_check(
+def test_a_late_level_whose_times_fit_is_not_referred_to_the_check(
     small: Path, tmp_path: Path
 ) -> None:
     config = load(small, ["clock.mode=realtime", *BUDGET])

@@ -1,4 +1,4 @@
-"""Campaigns on real racks: small ones, few faults; and what they must notice."""
+"""Tests small campaigns with few faults on real racks, and the mistakes that they must detect."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ LOCKSTEP = ("--lockstep", "--injections", "2", "--seed", "4", "--seconds", "9", 
 
 
 @pytest.mark.slow
-def test_a_killed_campaign_goes_on_and_every_death_and_hang_is_found_and_survived(
+def test_a_killed_campaign_continues_and_detects_every_death_and_hang(
     small: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "campaign"
@@ -78,7 +78,7 @@ def test_a_killed_campaign_goes_on_and_every_death_and_hang_is_found_and_survive
 
 @pytest.mark.slow
 @pytest.mark.parametrize("numbers", [(signal.SIGTERM,), (signal.SIGINT,) * 2])
-def test_a_signal_ends_trials_in_the_middle_of_their_launch_and_keeps_those_before(
+def test_a_signal_ends_launching_trials_and_keeps_finished_ones(
     small: Path, write: Callable[[str, str], Path], tmp_path: Path, numbers: tuple[int, ...]
 ) -> None:
     write("stalling.py", STALLING)
@@ -133,7 +133,7 @@ def semaphores_of_python() -> set[str]:
 
 
 @pytest.mark.slow
-def test_boards_killed_from_outside_are_found_and_come_back(small: Path, tmp_path: Path) -> None:
+def test_boards_killed_from_outside_are_detected_and_restarted(small: Path, tmp_path: Path) -> None:
     out = tmp_path / "campaign"
     done = campaign(small, "--lockstep", "--kills", "3", "--seconds", "12", "--out", out, "--json")
     summary = json.loads(done.stdout)["summary"]
@@ -150,16 +150,19 @@ def test_boards_killed_from_outside_are_found_and_come_back(small: Path, tmp_pat
             ["--seconds", "9", "--kinds", "murder"],
             "--kinds murder: there is no such kind; valid kinds: kill, ",
         ),
-        (["--lockstep", "--realtime"], "--lockstep and --realtime: they exclude each other"),
+        (["--lockstep", "--realtime"], "--lockstep and --realtime exclude each other"),
         (
             ["--kills", "3", "--kinds", "kill"],
             "--kills 3 and --kinds kill: kills from outside are a kind of their own",
         ),
-        (["--set", "board.upper.ends_run=false"], "no board ends the run: give --seconds"),
+        (
+            ["--set", "board.upper.ends_run=false"],
+            "no board ends the run; give its simulated time with --seconds",
+        ),
         (["--set", "clock.wake=no"], 'clock.wake = "no": '),
     ],
 )
-def test_bad_input_is_one_line_that_lists_what_is_valid(
+def test_bad_input_is_refused_in_one_line_with_valid_values(
     small: Path, options: list[str], line: str
 ) -> None:
     done = campaign(small, *options)

@@ -1,4 +1,4 @@
-"""`rack check` as a user runs it: its tables, the changes that it proposes, and its exit status."""
+"""Tests `rack check` as a user runs it: tables, proposed changes and exit status."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ ALONE = ("--set", "board.lower.core=1", "--set", "board.lower.priority=80")
 
 @pytest.fixture(autouse=True)
 def two_cores() -> Iterator[None]:
-    """Let every machine have two cores: the cheapest change depends on them."""
+    """Pretend that the machine has two cores, because the cheapest change depends on them."""
     before = os.sched_getaffinity(0)
     os.sched_setaffinity(0, sorted(before)[:2])
     yield
@@ -90,7 +90,7 @@ def test_a_fixed_config_loads_and_holds(small: Path, tmp_path: Path) -> None:
     assert again.stdout == config.text()
 
 
-def test_where_nothing_helps_no_config_is_printed(small: Path) -> None:
+def test_no_config_is_printed_if_no_change_helps(small: Path) -> None:
     done = check(small, "--set", "board.lower.budget.process_ms=100", "--fix")
     assert (done.returncode, done.stdout) == (1, "")
     assert done.stderr.startswith("no change helps with 3.1 of lower")
@@ -120,7 +120,9 @@ def test_budgets_come_from_an_earlier_run_and_are_in_a_fixed_config(
 def test_a_run_of_another_rack_is_refused_in_one_line(recorded: Path) -> None:
     done = check("fig2", "--from", recorded)
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == f"{recorded}: a run of other boards: lower, upper; 'fig2' has level\n"
+    assert (
+        done.stderr == f"{recorded}: its boards are lower, upper, but those of 'fig2' are level\n"
+    )
 
 
 @pytest.mark.slow
@@ -141,7 +143,7 @@ def test_a_static_schedule_is_a_table_of_its_distinct_frames() -> None:
 
 
 @pytest.mark.slow
-def test_verbose_shows_what_the_arm_does_while_no_torque_comes() -> None:
+def test_verbose_shows_the_motion_of_the_arm_without_new_torques() -> None:
     words = ("nasrem", "--set", "robot.patience_ms=10")
     (line,) = (line for line in check(*words).stdout.splitlines() if line.startswith("patience: "))
     assert "'servo' keeps its last torque for 10 ms (4 cycles; at most 10.0 ms)" in line

@@ -1,8 +1,7 @@
-"""`rack check` of mutated configs: whatever they contain, it ends in time with exit status 0, 1 or
-2.
+"""Tests `rack check` with mutated configs: it always ends in time with exit status 0, 1 or 2.
 
-1 has one meaning: the config is valid, and its timing does not fit. Everything else is a mistake,
-one per line.
+Status 1 means only that the config is valid and its timing does not fit. Any other problem is a
+mistake, reported in one line.
 """
 
 from __future__ import annotations
@@ -48,8 +47,7 @@ PIECES = ("=", "[", "]]", '"', "1990-03-01", "0x", "\x7f", "\ufeff", "#", "\t", 
 
 @cache
 def texts() -> dict[str, dict[str, Any]]:
-    """Every shipped config, as written and resolved; tables that are not a whole rack extend one
-    that is."""
+    """Every shipped config, as written and resolved. Partial configs extend a complete one."""
     found = {
         str(path.relative_to(CONFIGS)): tomllib.loads(path.read_text())
         for path in sorted(CONFIGS.rglob("*.toml"))
@@ -63,7 +61,7 @@ def texts() -> dict[str, dict[str, Any]]:
 
 
 def places(node: Any) -> Iterator[tuple[Any, Any]]:
-    """Yield every value by what holds it and its key or number in there."""
+    """Yield every value with its container and its key or index."""
     keys = list(node) if isinstance(node, dict) else range(len(node))
     for key in keys:
         yield node, key
@@ -92,8 +90,7 @@ def spoil(tables: dict[str, Any], draw: random.Random) -> None:
 
 
 def torn(text: str, draw: random.Random) -> str:
-    """Return text that was edited without care: a line twice, a line less, the end lost, a stray
-    piece."""
+    """Return a text after careless editing: a line doubled, removed, cut off or inserted."""
     lines = text.splitlines()
     at = draw.randrange(len(lines))
     line, rest, piece = lines[at], lines[at + 1 :], draw.choice(PIECES)
@@ -105,7 +102,7 @@ def torn(text: str, draw: random.Random) -> str:
 
 
 def spoilt(draw: random.Random) -> str:
-    """Draw the text of a config with one to three changes."""
+    """Return the text of a config with one to three random changes."""
     tables = copy.deepcopy(texts()[draw.choice(sorted(texts()))])
     for _ in range(draw.randint(1, 3)):
         if tables:
@@ -116,7 +113,7 @@ def spoilt(draw: random.Random) -> str:
 
 @contextmanager
 def bounded() -> Iterator[None]:
-    """Let the body have so much processor time, and no more."""
+    """Limit the processor time of the body."""
 
     def end(signum: int, frame: object) -> None:
         raise TimeoutError(f"more than {BOUND_S} s of processor time")
@@ -135,7 +132,7 @@ def no_constant(name: str) -> float:
 
 
 def check(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, dict[str, Any]]:
-    """Return the status of `rack check --json`, in this process, and its answer."""
+    """Run `rack check --json` in this process, and return its exit status and answer."""
     capsys.readouterr()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", ["rack", "check", *arguments, "--json"])
@@ -157,7 +154,7 @@ def judge(status: int, document: dict[str, Any]) -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)  # a machine that is shared: the bound is processor time
-def test_a_spoilt_config_is_answered_in_time_with_what_is_wrong(
+def test_a_mutated_config_gets_an_answer_in_time(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path, seen = tmp_path / "spoilt.toml", set()
@@ -185,7 +182,7 @@ ATTACKS = {
 
 
 @pytest.mark.parametrize(("rack", "setting", "place"), ATTACKS.values(), ids=ATTACKS)
-def test_what_made_rack_check_hang_or_fall_is_a_mistake_on_one_line(
+def test_configs_that_once_hung_or_crashed_the_check_are_mistakes(
     capsys: pytest.CaptureFixture[str], rack: str, setting: str, place: str
 ) -> None:
     status, document = check(capsys, rack, "--set", setting)
@@ -193,7 +190,7 @@ def test_what_made_rack_check_hang_or_fall_is_a_mistake_on_one_line(
     assert [line.startswith(f"{place} ") for line in document["error"]] == [True]
 
 
-def test_the_longest_cycles_and_plans_there_are_are_judged_in_time(
+def test_the_longest_possible_cycles_and_plans_are_judged_in_time(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     settings = ("clock.period_ms=0.01", "timing.clock_ms=0.009999", "board.level.every=1000000")

@@ -1,4 +1,4 @@
-"""The commands as a user runs them: answers, exit statuses, and nothing left behind."""
+"""Tests the commands as a user runs them: answers, exit statuses, and nothing left behind."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.tools.command_line import BOUND_S, ROOT, rack
 
 @contextmanager
 def launched(small: Path, name: str, *arguments: str) -> Iterator[subprocess.Popen[str]]:
-    """A rack in real time without an end, past its first cycles."""
+    """A real-time rack without an end, after its first cycles."""
     command = [*RACK, "run", str(small), "--set", "clock.mode=realtime"]
     process = subprocess.Popen(
         [*command, "--set", f"name={name}", *arguments],
@@ -61,8 +61,7 @@ HEAVY = ("mujoco", "numba", "numpy", "pyarrow", "pydantic", "rerun", "typer")
 
 
 def imported(*arguments: object) -> set[str]:
-    """Run a command as a process of its own; return which of the heavy libraries it has
-    imported."""
+    """Run a command as a separate process, and return the heavy libraries that it imported."""
     command = [sys.executable, "-X", "importtime", *RACK[1:], *map(str, arguments)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S)
     assert done.returncode == 0, done.stderr[-2000:]
@@ -139,7 +138,7 @@ def test_a_config_with_mistakes_is_refused_before_anything_starts(
 
 
 def upper_of(small: Path, source: str) -> Path:
-    """Let the upper level of the small rack be of a module of the user's."""
+    """Let the upper level of the small rack be a class of a user's module."""
     (small.parent / "own_upper.py").write_text(source)
     text = small.read_text().replace('python_path = ["', f'python_path = ["{small.parent}", "')
     small.write_text(text.replace("two_levels:Upper", "own_upper:Upper"))
@@ -220,7 +219,7 @@ def test_ctrl_c_ends_a_run_in_order(small: Path, rack_name: str, tmp_path: Path)
 
 
 @pytest.mark.slow
-def test_what_a_killed_launcher_leaves_is_cleaned(
+def test_leftovers_of_a_killed_launcher_are_cleaned(
     running: subprocess.Popen[str], rack_name: str
 ) -> None:
     running.kill()

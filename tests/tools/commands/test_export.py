@@ -1,4 +1,4 @@
-"""`rack export`: what is in the MCAP file is what was recorded, with units and meanings."""
+"""Tests `rack export`: the MCAP file contains the recording, with units and meanings."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def exported(run: Path) -> Path:
     return run / "run.mcap"
 
 
-def test_every_message_is_there_as_it_was_written(run: Path, exported: Path) -> None:
+def test_every_message_is_exported_as_it_was_written(run: Path, exported: Path) -> None:
     recording = Recording(run)
     clock_ns = recording.layout.clock_ns
     ticks: dict[str, list[int]] = {}
@@ -75,12 +75,12 @@ def test_schemas_have_units_and_meanings(run: Path, exported: Path) -> None:
     assert schemas["lower.status"]["state"]["type"] == "string"
 
 
-def test_what_cannot_be_exported_is_one_line(
+def test_a_refused_export_is_reported_in_one_line(
     run: Path, exported: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     size = exported.stat().st_size
     for words, status, why in (
-        ((run,), 2, f"{exported}: exists; remove it, or give another --out"),
+        ((run,), 2, f"{exported}: exists already; remove it, or give another --out"),
         ((tmp_path,), 2, f"{tmp_path}: not a run: it has no config.toml"),
         ((run, "--out", "/dev/full/x"), 2, '"/dev/full/x.part": Not a directory'),
     ):

@@ -1,4 +1,4 @@
-"""`rack gantt` as a user runs it: text, pictures, JSON, and one line for what is refused."""
+"""Tests `rack gantt` as a user runs it: text, pictures, JSON, and refusals in one line."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.tools.recordings import cycle, recorded
 
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
-    """A run of fig2 that is exact to the millisecond, but for one late plan."""
+    """A run of fig2 that is exact to the millisecond, except for one late plan."""
     ms = (0, 0, 1, 3, 4)
     levels = [cycle(4 * n, 2000, *(1000 * (8 * n + at) for at in ms)) for n in range(20)]
     plans = []
@@ -130,12 +130,12 @@ def test_figure_5_is_printed_and_drawn(tmp_path: Path) -> None:
         (["nosuch"], "no such file; valid are a path or one of the names "),
         (["configs/tasks"], "configs/tasks: not a run: it has no config.toml"),
         (["crossing", "--set", "board.servo.slot=3"], "slot"),
-        (["fig2", "--figure", "3"], "--figure 3: permitted: 5"),
+        (["fig2", "--figure", "3"], "--figure 3: must be 5"),
         (
             ["fig2", "--process", "arm=3"],
             "--process arm: no board of that name has a budget; boards: level",
         ),
-        (["fig2", "--out", "README.md"], "--out README.md: no folder for pictures: File exists"),
+        (["fig2", "--out", "README.md"], "--out README.md: cannot create the folder: File exists"),
     ],
 )
 def test_bad_arguments_are_refused_in_one_line(words: list[str], message: str) -> None:
@@ -145,7 +145,7 @@ def test_bad_arguments_are_refused_in_one_line(words: list[str], message: str) -
     assert len(shown.stderr.splitlines()) == 1
 
 
-def test_a_run_cannot_be_asked_for_what_it_does_not_have(run: Path) -> None:
+def test_a_window_outside_the_run_is_refused(run: Path) -> None:
     assert (
         "outside the run, which lasts from 0 to 160 ms"
         in rack("gantt", run, "--from-ms", 500).stderr

@@ -1,4 +1,4 @@
-"""`rack inject` and `rack estop` on a rack that runs, and what they refuse."""
+"""Tests `rack inject` and `rack estop` on a running rack, and their refusals."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ TASKS = "wave, wave.planner, watch, driven, clock"
 
 @pytest.fixture(scope="module")
 def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """The name of a rack in real time that runs until it is stopped."""
+    """Name of a real-time rack that runs until it is stopped."""
     path, name = tmp_path_factory.mktemp("rack") / "waves.toml", f"test-inject-{os.getpid()}"
     path.write_text(DRIVEN)
     command = [*RACK, "run", str(path), "--no-record", "--set", "clock.mode=realtime"]
@@ -120,7 +120,9 @@ REFUSED = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("words", "line"), REFUSED.items(), ids=REFUSED)
-def test_what_cannot_be_is_one_line_that_says_what_can(running: str, words: str, line: str) -> None:
+def test_an_impossible_fault_is_refused_with_valid_values(
+    running: str, words: str, line: str
+) -> None:
     done = rack("inject", running, *words.split())
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
     assert done.stderr.startswith(line)
@@ -143,7 +145,7 @@ IMPOSSIBLE: list[tuple[str, dict[str, str], str]] = [
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("kind", "keys", "line"), IMPOSSIBLE)
-def test_a_fault_that_a_running_rack_cannot_have_is_not_added(
+def test_a_fault_that_does_not_fit_the_rack_is_not_added(
     running: str, kind: str, keys: dict[str, str], line: str
 ) -> None:
     injected = Segment.attach(running).words[System.INJECTED]

@@ -1,5 +1,7 @@
-"""Racks seen from another PID namespace with the same shared memory, as from a container that has
-the IPC namespace of its host."""
+"""Tests racks seen from another PID namespace with the same shared memory.
+
+A container that shares the IPC namespace of its host sees them in this way.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,7 @@ INSIDE = ("unshare", "--pid", "--fork", "--kill-child", "--mount-proc")
 
 
 def why_not() -> str:
-    """Return why this machine makes no PID namespace; empty if it does."""
+    """Return why this machine cannot create PID namespaces, or an empty text."""
     if shutil.which(INSIDE[0]) is None:
         return "no unshare (util-linux)"
     return subprocess.run([*INSIDE, "true"], capture_output=True, text=True).stderr
@@ -35,20 +37,20 @@ pytestmark = [
 
 
 def inside(*arguments: str) -> subprocess.CompletedProcess[str]:
-    """Run a command in a PID namespace of its own."""
+    """Run a command in a new PID namespace."""
     command = [*INSIDE, *RACK, *arguments]
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S)
 
 
 @pytest.fixture
 def held(rack_name: str, tmp_path: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """The launcher of a recorded rack of this namespace, held before tick 0."""
+    """Launcher of a recorded rack in this namespace, held before tick 0."""
     with held_rack(tmp_path, rack_name, "--out", tmp_path / "run") as (process, _):
         yield process
 
 
 def seen(name: str) -> dict[str, object]:
-    """Return what `rack list` says about a rack in another PID namespace."""
+    """Return what `rack list` reports about a rack in another PID namespace."""
     rows = json.loads(inside("list", "--json").stdout)
     return next(row for row in rows if row["rack"] == name)
 

@@ -1,4 +1,4 @@
-"""`rack new`: what it writes runs, and passes its test, as it is."""
+"""Tests `rack new`: the written files run, and pass their test, without changes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ NUMBERS = count()
 
 @pytest.fixture
 def name() -> str:
-    """A name that no other module of this process has, nor a rack of another one."""
+    """A name that no module of this process and no other rack has."""
     return f"soft_touch_{os.getpid()}_{next(NUMBERS)}"
 
 
@@ -48,7 +48,7 @@ def test_it_writes_a_class_a_config_and_a_test_with_the_users_name(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
-def test_what_it_writes_runs_and_passes_its_test(kind: str, name: str, tmp_path: Path) -> None:
+def test_the_written_files_run_and_pass_their_test(kind: str, name: str, tmp_path: Path) -> None:
     done = rack("new", kind, name, folder=tmp_path)
     assert f"next: rack run {name}/{name}.toml --lockstep --seconds 2; pytest {name}" in done.stdout
     run = [*("run", f"{name}/{name}.toml", "--lockstep", "--seconds", "2", "--no-record")]
@@ -83,21 +83,21 @@ def test_a_new_level_reports_its_own_event_once_its_live_limit_is_set(
 @pytest.mark.parametrize(
     ("name", "why"),
     [
-        ("", "permitted: a-z, 0-9 and '_'"),
-        ("3d", "permitted: a-z, 0-9 and '_'"),
-        ("class", "permitted: a-z, 0-9 and '_'"),
-        ("a-b", "permitted: a-z, 0-9 and '_'"),
-        ("../up", "permitted: a-z, 0-9 and '_'"),
-        ("Upper", "permitted: a-z, 0-9 and '_'"),
-        ("a" * 41, "permitted: a-z, 0-9 and '_'"),
+        ("", "must be at most 40 of a-z, 0-9 and '_'"),
+        ("3d", "must be at most 40 of a-z, 0-9 and '_'"),
+        ("class", "must be at most 40 of a-z, 0-9 and '_'"),
+        ("a-b", "must be at most 40 of a-z, 0-9 and '_'"),
+        ("../up", "must be at most 40 of a-z, 0-9 and '_'"),
+        ("Upper", "must be at most 40 of a-z, 0-9 and '_'"),
+        ("a" * 41, "must be at most 40 of a-z, 0-9 and '_'"),
         ("json", "an installed module has that name"),
         ("nasrem", "a bundled config, or a board of nasrem, has that name"),
         ("servo", "a bundled config, or a board of nasrem, has that name"),
-        ("executor", "its class Executor would have the name of one that it uses"),
-        ("answering", "its class AnsweringStatus would have the name of one that it uses"),
+        ("executor", "its class would be named Executor, as a class that it uses"),
+        ("answering", "its class would be named AnsweringStatus, as a class that it uses"),
     ],
 )
-def test_a_name_that_cannot_be_is_refused_in_one_line(name: str, why: str, tmp_path: Path) -> None:
+def test_an_unusable_name_is_refused_in_one_line(name: str, why: str, tmp_path: Path) -> None:
     done = rack("new", "level", name, folder=tmp_path)
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.startswith(f'NAME = "{name}": {why}')
@@ -105,7 +105,7 @@ def test_a_name_that_cannot_be_is_refused_in_one_line(name: str, why: str, tmp_p
     assert not [*tmp_path.iterdir()]
 
 
-def test_what_is_there_stays_as_it_is(tmp_path: Path) -> None:
+def test_an_existing_folder_is_not_changed(tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "mine.py").write_text("mine")
     (tmp_path / "file").write_text("mine")
@@ -113,7 +113,7 @@ def test_what_is_there_stays_as_it_is(tmp_path: Path) -> None:
     for taken in ("mine", "file", "nowhere"):
         done = rack("new", "level", "mine", "--out", taken, folder=tmp_path)
         assert (done.returncode, done.stdout) == (2, "")
-        assert f"'{taken}' is there already" in done.stderr
+        assert f"'{taken}' exists already" in done.stderr
     assert [*(tmp_path / "mine").iterdir()] == [tmp_path / "mine" / "mine.py"]
     assert (tmp_path / "mine" / "mine.py").read_text() == "mine"
 

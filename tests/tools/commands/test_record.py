@@ -1,5 +1,4 @@
-"""`rack record` on a running rack; the viewer without a screen, `rack replay` without a
-recording."""
+"""Tests `rack record` on a running rack, and `rack replay` without a screen or a recording."""
 
 from __future__ import annotations
 
@@ -72,7 +71,7 @@ def test_a_rack_that_runs_can_be_recorded_until_its_end(
 
 
 @pytest.mark.slow
-def test_what_a_run_has_recorded_is_saved_while_it_goes_on(
+def test_the_recording_so_far_is_saved_while_the_run_continues(
     small: Path, rack_name: str, tmp_path: Path
 ) -> None:
     run, saved = tmp_path / "run", tmp_path / "saved"
@@ -113,11 +112,9 @@ def test_what_a_run_has_recorded_is_saved_while_it_goes_on(
     assert report["recording"] == "without the end of the run"
 
 
-def test_a_rack_that_nothing_records_has_nothing_to_save(
-    small: Path, rack_name: str, tmp_path: Path
-) -> None:
+def test_an_unrecorded_rack_cannot_be_saved(small: Path, rack_name: str, tmp_path: Path) -> None:
     with Rack(load(small, [f"name={rack_name}"])):
-        with pytest.raises(Failure, match=f"--save {rack_name}: nothing records it"):
+        with pytest.raises(Failure, match=f"--save {rack_name}: the rack is not recorded"):
             record(rack_name, others=[], out=tmp_path / "saved", save=True)
         with pytest.raises(Failure, match="--save, --view: give one of them"):
             record(rack_name, others=[], out=None, view=True, save=True)
@@ -166,7 +163,7 @@ def test_racks_that_work_together_are_recorded_on_one_time_line(
 
 
 def kill_thread(pid: int, number: int) -> None:
-    """Send a signal to another thread than the first, as the kernel may do by itself."""
+    """Send a signal to a thread other than the first, as the kernel may do."""
     others = []
     for thread in Path(f"/proc/{pid}/task").iterdir():
         # A thread may end while they are listed.
@@ -217,14 +214,14 @@ def test_a_signal_ends_recordings_at_once_and_leaves_their_merging_to_the_user(
         assert not (each / "recorder.spool").exists()
 
 
-def test_replay_makes_a_file_only_where_none_is_and_only_of_runs(tmp_path: Path) -> None:
+def test_replay_writes_only_new_files_and_only_from_runs(tmp_path: Path) -> None:
     out = tmp_path / "both.rrd"
     runs = [recorded(A, [B], tmp_path / "a").folder, recorded(B, [], tmp_path / "b").folder]
     replay(runs, out, against=None)
     made = out.read_bytes()
     for given, file, why in (
         (runs, out, "both.rrd: exists already"),
-        (runs, tmp_path / "both.png", "permitted: a name that ends in .rrd"),
+        (runs, tmp_path / "both.png", "the name of a file for the viewer must end in .rrd"),
         ([runs[0], out], tmp_path / "new.rrd", "both.rrd: not the folder of a run"),
         ([runs[0], tmp_path / "c"], tmp_path / "new.rrd", "c: no such folder"),
         ([runs[0], runs[0]], tmp_path / "new.rrd", "both are of rack 'a'"),

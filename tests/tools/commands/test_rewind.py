@@ -1,4 +1,4 @@
-"""`rack rewind`: any tick of a run again, forwards, backwards, by a condition, and branches."""
+"""Tests `rack rewind`: going to any tick, forwards, backwards or by a condition, and branches."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class Asked:
-    """Asks `rack rewind --json` for lines; `status` is that of the last time."""
+    """Sends lines to `rack rewind --json`. `status` is the exit status of the last call."""
 
     def __init__(self, run: Path, patch: pytest.MonkeyPatch) -> None:
         self._run = run
@@ -58,7 +58,7 @@ class Asked:
 
 @pytest.fixture
 def asked(run: Path, monkeypatch: pytest.MonkeyPatch) -> Asked:
-    """Ask for lines on the run."""
+    """Sends lines to a prompt on the run."""
     return Asked(run, monkeypatch)
 
 
@@ -76,16 +76,14 @@ def test_any_tick_is_reached_and_its_messages_shown(run: Path, asked: Asked) -> 
     assert first["fields"]["value"] == found[2]["value"] == value[479]
     assert [one["tick"] for one in found[3:6]] == [481, 491, 488]
     assert found[6]["value"]["fields"]["value"] == value[487]
-    assert found[8]["error"].startswith("-0.0025: permitted: 0 to 1.9975 s")
+    assert found[8]["error"].startswith("-0.0025: must be 0 to 1.9975 s")
     assert "wave.status: no message yet at 0 s" in found[9]["error"]
     # Nothing is done after quit.
     assert len(found) == 10
     assert asked.status == 2
 
 
-def test_a_condition_leads_to_where_it_begins_to_hold_forwards_and_backwards(
-    run: Path, asked: Asked
-) -> None:
+def test_a_condition_is_found_forwards_and_backwards(run: Path, asked: Asked) -> None:
     ticks, value = (Recording(run).signal("wave.status", name) for name in ("tick", "value"))
     limit = float(value[300]) + 1.0
     held = value > limit
@@ -108,7 +106,7 @@ def test_a_level_is_shown_as_it_was_at_that_tick(asked: Asked) -> None:
     assert found[5]["value"]["_recent"] == [tick % 7 for tick in range(115, 120)]
 
 
-def test_a_tick_that_was_reached_is_where_later_ones_go_on_from(
+def test_later_ticks_continue_from_the_nearest_reached_tick(
     run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     begun: list[int] = []
@@ -136,11 +134,11 @@ def test_a_tick_that_was_reached_is_where_later_ones_go_on_from(
 
 
 def continued_from(events: Sequence[Event]) -> int:
-    """Return the tick of the snapshot from which a rack went on; -1: none."""
+    """Return the tick of the snapshot from which a rack continued, or -1 without one."""
     return next((event.tick for event in events if event.code == CONTINUES), -1)
 
 
-def test_a_branch_differs_from_its_tick_on_and_an_unchanged_one_nowhere(
+def test_a_branch_differs_only_after_its_tick_and_only_if_changed(
     run: Path, asked: Asked, tmp_path: Path
 ) -> None:
     before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
@@ -161,26 +159,26 @@ def test_a_branch_differs_from_its_tick_on_and_an_unchanged_one_nowhere(
     assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
 
 
-def test_a_mistake_is_one_line_with_what_is_permitted(asked: Asked) -> None:
+def test_a_mistake_is_reported_in_one_line_with_the_usage(asked: Asked) -> None:
     lines = {
         "goot 3": "goot: no such command; nearest: goto",
-        "goto": 'goto: permitted: goto TIME, as in 12.5; or goto --when "',
-        "goto soon": "soon: permitted: 0 to 1.9975 s",
-        "goto nan": "nan: permitted: 0 to 1.9975 s",
-        "step x": "step: argument ticks: x: permitted: at most 1000000000000000 ticks, either way",
+        "goto": 'goto: usage: goto TIME, as in 12.5; or goto --when "',
+        "goto soon": "soon: must be 0 to 1.9975 s",
+        "goto nan": "nan: must be 0 to 1.9975 s",
+        "step x": "step: argument ticks: x: must be -1000000000000000 to 1000000000000000 ticks",
         f"step {DIGITS}": f"{DIGITS[:40]}",
-        f"back -{DIGITS}": "permitted: at most 1000000000000000 ticks, either way",
-        f"goto {DIGITS}": "permitted: 0 to 1.9975 s",
-        f"goto -{DIGITS}": "permitted: 0 to 1.9975 s",
-        f"events {DIGITS}": "permitted: 0 to 1e+09 s",
-        f"branch --seconds {DIGITS}": "permitted: 0 to 1e+09 s",
+        f"back -{DIGITS}": "must be -1000000000000000 to 1000000000000000 ticks",
+        f"goto {DIGITS}": "must be 0 to 1.9975 s",
+        f"goto -{DIGITS}": "must be 0 to 1.9975 s",
+        f"events {DIGITS}": "must be 0 to 1e+09 s",
+        f"branch --seconds {DIGITS}": "must be 0 to 1e+09 s",
         f"branch --set seed={DIGITS}": "integer too long; permitted: 64 bits",
         f"show wave.status.value[{DIGITS}]": "no such signal; nearest: wave.status.value",
         f"show wave.status.value[{12 * DIGITS}]": "wave.status.value[9",
         'goto --when "wave.status.valeu > 1"': "nearest: wave.status.value",
         "show wavf": "wavf: no such level, mailbox or signal; nearest: wave",
         "show wave.status.value[3]": "no such index",
-        "events -1": "-1: permitted: 0 to 1e+09 s",
+        "events -1": "-1: must be 0 to 1e+09 s",
         'show "wave': "No closing quotation",
         "help got": "got: no such command; nearest: goto",
     }
@@ -188,7 +186,7 @@ def test_a_mistake_is_one_line_with_what_is_permitted(asked: Asked) -> None:
     assert [why in one["error"] for why, one in zip(lines.values(), found, strict=False)] == [
         True
     ] * len(lines), found
-    assert "begun to hold" in found[-1]["help"]
+    assert "begins to hold" in found[-1]["help"]
     assert len(found) == len(lines) + 1
     assert asked.status == 2
     asked("goto 1", "events 2")

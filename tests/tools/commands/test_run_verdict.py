@@ -1,4 +1,4 @@
-"""The verdict on a run is one: in the exit status, the first line, the files and the documents."""
+"""Tests that exit status, first line, files and documents of a run have the same verdict."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LATE = "level 'lower' missed 0 and skipped 120 of its 120 cycles (100 %; at most
 
 
 @pytest.mark.slow
-def test_a_run_that_failed_has_one_verdict_everywhere(
+def test_a_failed_run_has_the_same_verdict_everywhere(
     small: Path, rack_name: str, tmp_path: Path
 ) -> None:
     settings = [word for setting in (f"name={rack_name}", *CRASHES) for word in ("--set", setting)]

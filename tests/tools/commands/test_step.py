@@ -1,5 +1,4 @@
-"""`rack step`: a rack in lockstep holds between ticks, goes on by cycles, and ends when it is
-stopped meanwhile."""
+"""Tests `rack step`: holding a rack in lockstep between ticks, stepping it, and stopping it."""
 
 from __future__ import annotations
 
@@ -23,13 +22,13 @@ from tests.tools.held_racks import held_rack
 
 @pytest.fixture
 def held(rack_name: str, tmp_path: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """The launcher of a rack that counts, held before tick 0."""
+    """Launcher of a counting rack, held before tick 0."""
     with held_rack(tmp_path, rack_name) as (process, _):
         yield process
 
 
 def stepped(name: str, *options: str) -> tuple[int, dict[str, str]]:
-    """Step a rack; return the tick before which it holds, and the row of its counter."""
+    """Step a rack, and return the tick before which it holds and the row of its counter."""
     done = rack("step", name, *options, "--json")
     assert done.returncode == 0, done.stderr
     answer = json.loads(done.stdout)
@@ -37,7 +36,7 @@ def stepped(name: str, *options: str) -> tuple[int, dict[str, str]]:
 
 
 @pytest.mark.slow
-def test_a_held_rack_goes_on_by_cycles_and_ticks(
+def test_a_held_rack_is_stepped_by_cycles_and_ticks(
     held: subprocess.Popen[bytes], rack_name: str
 ) -> None:
     assert [stepped(rack_name)[0] for _ in range(3)] == [1, 9, 17]
@@ -48,20 +47,20 @@ def test_a_held_rack_goes_on_by_cycles_and_ticks(
     tick, level = stepped(rack_name, "--until", "counter")
     assert (tick, level["row"]) == (41, "row 4 'turn', now in 'down', table saw")
     given = rack("command", rack_name, "counter", "table", "slow")
-    held_at = f"the rack is held before tick 41; 'rack step {rack_name}' lets it go on"
+    held_at = f"the rack is held before tick 41; 'rack step {rack_name}' continues it"
     assert given.stdout == f"command to 'counter', table slow: waits: {held_at}\n"
     tick, level = stepped(rack_name, "--cycles", "2", "--until", "counter")
     assert (tick, level["row"]) == (49, "row 4 'rest', now in 'resting', table slow")
     text = rack("step", rack_name, "--ticks", "1").stdout
     assert f"{rack_name}: held before tick 50, 0.125 s" in text
-    assert f"HELD: 'rack step {rack_name}' lets it go on" in rack("status", rack_name).stdout
+    assert f"HELD: 'rack step {rack_name}' continues it" in rack("status", rack_name).stdout
 
 
 @pytest.mark.slow
-def test_what_a_held_rack_is_asked_to_do_waits_and_is_done_when_it_goes_on(
+def test_requests_to_a_held_rack_wait_until_it_continues(
     held: subprocess.Popen[bytes], rack_name: str
 ) -> None:
-    waits = f"waits: the rack is held before tick 0; 'rack step {rack_name}' lets it go on"
+    waits = f"waits: the rack is held before tick 0; 'rack step {rack_name}' continues it"
     for words, before in {
         ("command", rack_name, "counter", "table", "slow"): "command to 'counter', table slow: ",
         ("inject", rack_name, "watch", "mute"): "mute of watch: armed, ",
@@ -82,10 +81,10 @@ def test_what_a_held_rack_is_asked_to_do_waits_and_is_done_when_it_goes_on(
 
 
 @pytest.mark.slow
-def test_a_rack_let_go_runs_is_held_again_and_ends_in_order(
+def test_a_released_rack_can_be_held_again_and_ends_in_order(
     held: subprocess.Popen[bytes], rack_name: str
 ) -> None:
-    assert rack("step", rack_name, "--run").stdout == f"rack '{rack_name}' runs on\n"
+    assert rack("step", rack_name, "--run").stdout == f"rack '{rack_name}' runs without holding\n"
     words = Segment.attach(rack_name).words
     wait_until(lambda: words[System.TICK] > 100 and not words[System.HELD])
     first, _ = stepped(rack_name, "--ticks", "1")
@@ -108,10 +107,10 @@ def test_a_held_rack_ends_with_its_launcher(held: subprocess.Popen[bytes], rack_
     [
         (
             ("--ticks", "1", "--until", "counter"),
-            "--ticks counts ticks, N, --cycles and --until count cycles",
+            "--ticks counts ticks, but N, --cycles and --until count cycles",
         ),
-        (("1", "--cycles", "1"), "N = 1: the same as --cycles; give one of them"),
-        (("--run", "--ticks", "1"), "--run lets the rack run on; leave out the steps"),
+        (("1", "--cycles", "1"), "N = 1: N and --cycles mean the same; give one of them"),
+        (("--run", "--ticks", "1"), "--run lets the rack run without holding; leave out the steps"),
     ],
 )
 def test_options_that_contradict_are_usage_errors(options: tuple[str, ...], reason: str) -> None:

@@ -1,4 +1,4 @@
-"""`rack watch` and `rack mailbox`, on racks that run: what they show is what was written."""
+"""Tests `rack watch` and `rack mailbox` on running racks: they show what was written."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.tools.held_racks import held_rack
 
 @pytest.fixture
 def held(rack_name: str, tmp_path: Path) -> Iterator[str]:
-    """The name of a rack that counts, held before tick 20."""
+    """Name of a counting rack, held before tick 20."""
     with held_rack(tmp_path, rack_name):
         assert rack("step", rack_name, "--ticks", "20").returncode == 0
         yield rack_name
@@ -45,15 +45,15 @@ def test_mailboxes_are_listed_and_their_newest_messages_shown(held: str) -> None
 
 
 @pytest.mark.slow
-def test_what_is_not_there_is_one_line(held: str, tmp_path: Path) -> None:
+def test_an_unknown_name_is_reported_in_one_line(held: str, tmp_path: Path) -> None:
     never = ("watch", held, "counter.status.row", "--when", "counter.status.row > 99")
     cases = {
         ("mailbox", held, "counter.stat"): "counter.stat: no such mailbox; nearest: coun",
         ("mailbox", held, "--watch"): "--watch needs the NAME of a mailbox",
         ("watch", held, "counter.status.rwo"): "counter.status.rwo: no such signal; nearest: count",
         ("watch", held, "counter.status.row", "--out", "x.csv"): "--out needs --when; give both",
-        ("watch", held, "counter.status.row", "--every", "1"): "--every 1: not a time; permitted: ",
-        ("watch", held, "counter.status.row", "--after", "9e3s"): "--after 9e3s: not a time; permi",
+        ("watch", held, "counter.status.row", "--every", "1"): "--every 1: must be a time, ",
+        ("watch", held, "counter.status.row", "--after", "9e3s"): "--after 9e3s: must be a time, ",
         (*never, "--out", "missing/x.csv"): '"missing/x.csv": No such file or directory',
         (*never, "--out", "."): '".": Is a directory',
         ("watch", held, "counter.status.row", "--when", "counter.status.row > nan"): (
@@ -89,7 +89,7 @@ def test_every_message_is_shown_until_the_run_ends(
 
 
 @pytest.mark.slow
-def test_a_moment_is_saved_with_what_was_around_it(held: str, tmp_path: Path) -> None:
+def test_a_window_around_a_trigger_is_saved(held: str, tmp_path: Path) -> None:
     signals = ("counter.status.fired", "watch.status.state")
     condition = "counter.status.row == 4"
     with in_thread(lambda: go_on(held, '"rows"')):
@@ -125,7 +125,7 @@ def test_a_moment_is_saved_with_what_was_around_it(held: str, tmp_path: Path) ->
     ],
     ids=["full disk", "never"],
 )
-def test_a_moment_that_does_not_come_or_fit_is_said(
+def test_a_trigger_that_fails_or_does_not_fit_is_reported(
     held: str, words: tuple[str, ...], until: str, said: str
 ) -> None:
     with in_thread(lambda: go_on(held, until, ticks=80)):
@@ -134,8 +134,7 @@ def test_a_moment_that_does_not_come_or_fit_is_said(
 
 
 def go_on(name: str, until: str, ticks: int = 8000) -> None:
-    """Step a rack by 8 ticks until this text was printed, for so many ticks at most; end its
-    run."""
+    """Step a rack by 8 ticks until a text is printed, up to a number of ticks, then end its run."""
     stepper = Stepper(Segment.attach(name))
     tick = stepper.hold()
     for step in range(0, ticks, 8):
@@ -148,7 +147,7 @@ def go_on(name: str, until: str, ticks: int = 8000) -> None:
     Segment.attach(name).words[System.STOP_REQUEST] = 1
 
 
-def test_a_time_is_one_of_all_units() -> None:
+def test_times_are_accepted_in_all_units() -> None:
     assert [watch._seconds("--every", text) for text in ("20ms", "0.5s", "2 min")] == [
         0.02,
         0.5,

@@ -1,5 +1,4 @@
-"""A level that sends its launcher a signal at the moment of its life that MOMENT names, as often as
-SIGNALS has it."""
+"""A level that sends its launcher a signal at the moment MOMENT, SIGNALS times."""
 
 from __future__ import annotations
 
@@ -14,15 +13,14 @@ TICK = 24
 
 
 def launcher() -> int:
-    """Return the launcher: the parent of the child in which it tries this module, or this process
-    itself."""
+    """Return the launcher: the parent of the child that tries this module, or this process."""
     parent = os.getppid()
     is_tried = b"rack.tools.cli" in Path(f"/proc/{parent}/cmdline").read_bytes()
     return parent if is_tried else os.getpid()
 
 
 def send(moment: str) -> None:
-    """Send the signals when this is their moment."""
+    """Send the signals if this is their moment."""
     if os.environ["MOMENT"] == moment:
         # The launcher tries it in a child and starts the crate; the crate forks the boards.
         here = {"config": launcher, "crate": os.getppid}.get(
@@ -36,7 +34,7 @@ send("crate" if sys.argv[0].endswith("crate/__main__.py") else "config")
 
 
 class Signalling(Upper):
-    """Counts, and sends."""
+    """Counts, and sends the signals."""
 
     def self_test(self) -> None:
         """Send during the launch, when there is a segment."""

@@ -1,5 +1,4 @@
-"""SIGINT, SIGTERM and SIGHUP at any moment of a run: the exit status says which, and nothing is
-left."""
+"""Tests SIGINT, SIGTERM and SIGHUP at any moment of a run: exit status, and nothing left behind."""
 
 from __future__ import annotations
 
@@ -118,7 +117,7 @@ def test_a_signal_to_the_whole_group_after_any_time_leaves_nothing(
 
 
 @pytest.mark.slow
-def test_a_terminal_that_is_gone_ends_a_run_in_order(
+def test_closing_the_terminal_ends_a_run_in_order(
     small: Path, rack_name: str, tmp_path: Path
 ) -> None:
     pid, terminal = pty.fork()

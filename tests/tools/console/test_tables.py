@@ -1,4 +1,4 @@
-"""Tables: they fit the terminal, and in a pipe nothing is cut or coloured."""
+"""Tests that tables fit the terminal, and are neither cut nor coloured in a pipe."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_a_table_fits_its_width_with_long_cells_wrapped(width: int) -> None:
     assert " ".join(" ".join(lines).split()).count("12") == 1
 
 
-def test_columns_that_may_be_missing_go_before_anything_is_wrapped() -> None:
+def test_optional_columns_are_dropped_before_cells_are_wrapped() -> None:
     assert list(table(HEAD, ROWS, 40, ("what it says of itself", "count"))) == [
         "task            count",
         "servo              12",
@@ -64,7 +64,7 @@ BLOCKS = (
 )
 
 
-def test_a_text_is_the_same_facts_as_markdown_and_in_a_pipe() -> None:
+def test_markdown_and_pipe_output_have_the_same_content() -> None:
     assert render_markdown(BLOCKS) == (
         "# Levels\n"
         "| R    | level | d |\n"
@@ -82,7 +82,7 @@ def test_a_text_is_the_same_facts_as_markdown_and_in_a_pipe() -> None:
     ]
 
 
-def test_on_a_terminal_titles_lose_their_mark() -> None:
+def test_titles_on_a_terminal_have_no_hash_sign() -> None:
     terminal = Console(width=40, record=True, file=io.StringIO())
     show_blocks(BLOCKS, terminal)
     lines = [line.rstrip() for line in terminal.export_text().splitlines()]

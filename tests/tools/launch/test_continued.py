@@ -1,5 +1,4 @@
-"""`rack run --from RUN@TIME`: what continues or is repeated, and what is refused, writing
-nothing."""
+"""Tests `rack run --from RUN@TIME`: continued and repeated runs, and refusals."""
 
 from __future__ import annotations
 
@@ -47,9 +46,7 @@ def content(run: Path) -> dict[Path, bytes]:
 
 
 @pytest.mark.slow
-def test_a_run_continues_and_its_recording_begins_there_and_names_it(
-    run: Path, tmp_path: Path
-) -> None:
+def test_a_continued_run_is_recorded_with_its_origin(run: Path, tmp_path: Path) -> None:
     before = content(run)
     two = tmp_path / "two"
     done = rack(
@@ -80,7 +77,7 @@ def test_a_run_continues_and_its_recording_begins_there_and_names_it(
 
 
 @pytest.mark.slow
-def test_the_run_that_a_branch_continues_is_found_if_it_is_the_very_run(
+def test_the_origin_of_a_branch_is_found_only_if_it_is_unchanged(
     run: Path, small: Path, rack_name: str, tmp_path: Path
 ) -> None:
     rack("run", "--from", f"{run}@1.2", "--seconds", SECONDS, "--out", tmp_path / "two", "--json")
@@ -100,7 +97,7 @@ def test_the_run_that_a_branch_continues_is_found_if_it_is_the_very_run(
 
 
 @pytest.mark.slow
-def test_an_origin_that_is_none_is_refused(run: Path) -> None:
+def test_an_invalid_origin_is_refused(run: Path) -> None:
     (run / ORIGIN).write_text("{}")
     with pytest.raises(Failure, match=r"origin\.json: damaged, or changed later"):
         write_report(run)
@@ -118,14 +115,14 @@ def test_a_run_in_an_outage_has_no_state_and_the_time_is_refused(
     whole = rack("run", small, "--lockstep", *names, *common)
     refused = rack("run", "--from", f"{one}@1.2", "--no-record", *common)
     assert (refused.returncode, refused.stderr.count("\n")) == (2, 1), refused.stderr
-    assert "1.2: a board is lost then" in refused.stderr
+    assert "1.2: a board is lost at this time" in refused.stderr
     # Back, and restarted, it goes on; the loss counts.
     later = rack("run", "--from", f"{one}@1.8", "--no-record", *common)
     assert json.loads(later.stdout)["digest"] == json.loads(whole.stdout)["digest"]
 
 
 @pytest.mark.slow
-def test_a_state_that_is_not_as_recorded_is_noted(
+def test_a_state_that_differs_from_the_recording_is_noted(
     small: Path, rack_name: str, tmp_path: Path
 ) -> None:
     code = (Path(__file__).parents[2] / "two_levels.py").read_text()
@@ -168,7 +165,7 @@ def test_a_run_that_continues_another_is_continued(run: Path, tmp_path: Path) ->
 def test_a_time_outside_the_run_is_refused(recorded: Path, tmp_path: Path, at: str) -> None:
     refused = rack("run", "--from", f"{recorded}@{at}", "--out", tmp_path / "two")
     assert (refused.returncode, refused.stderr.count("\n")) == (2, 1)
-    assert f"{at}: permitted: 0 to 1.9975 s" in refused.stderr
+    assert f"{at}: must be 0 to 1.9975 s" in refused.stderr
     assert not (tmp_path / "two").exists()
 
 
@@ -177,12 +174,14 @@ def test_a_time_outside_the_run_is_refused(recorded: Path, tmp_path: Path, at: s
     ("arguments", "why"),
     [
         (("--from", "runs/none@3"), "--from runs/none@3: runs/none is not a run"),
-        (("--from", "runs/none"), "permitted: RUN@TIME, as in runs/nasrem-1@12.5"),
-        (("nasrem", "--from", "runs/none@3"), "CONFIG, or --from RUN@TIME in its place"),
-        ((), "CONFIG, or --from RUN@TIME in its place"),
+        (("--from", "runs/none"), "must be RUN@TIME, as in runs/nasrem-1@12.5"),
+        (("nasrem", "--from", "runs/none@3"), "give either CONFIG or --from RUN@TIME"),
+        ((), "give either CONFIG or --from RUN@TIME"),
     ],
 )
-def test_what_is_no_run_is_refused(arguments: tuple[object, ...], why: str, tmp_path: Path) -> None:
+def test_a_folder_that_is_not_a_run_is_refused(
+    arguments: tuple[object, ...], why: str, tmp_path: Path
+) -> None:
     refused = rack("run", *arguments, folder=tmp_path)
     assert (refused.returncode, refused.stderr.count("\n")) == (2, 1), refused.stderr
     assert why in refused.stderr
@@ -190,9 +189,7 @@ def test_what_is_no_run_is_refused(arguments: tuple[object, ...], why: str, tmp_
 
 
 @pytest.mark.slow
-def test_a_run_of_an_older_version_is_refused_unless_it_is_wanted_anyway(
-    run: Path, tmp_path: Path
-) -> None:
+def test_a_run_of_an_older_version_needs_the_option_anyway(run: Path, tmp_path: Path) -> None:
     again = ("run", "--from", f"{run}@1.2", "--seconds", SECONDS, "--no-record", "--json")
     code = run / "code.json"
     code.write_text(code.read_text().replace('"rack": "', '"rack": "0'))

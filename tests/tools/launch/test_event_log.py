@@ -1,4 +1,4 @@
-"""The event log of a run: complete at every moment, and in order of ticks at the end."""
+"""Tests that the event log of a run is complete at every moment, and sorted by ticks at the end."""
 
 from __future__ import annotations
 
@@ -16,15 +16,13 @@ KNOWN = (("launch", -1), ("died", 2800), ("rejoined", 3000), ("brakes", 2801), (
 
 
 def codes(path: Path) -> list[str]:
-    """Return what the lines of a log are about."""
+    """Return the codes of the events in a log."""
     entries = [json.loads(line) for line in path.read_text().splitlines()]
     return [entry.get("code", entry["kind"]) for entry in entries]
 
 
 @pytest.mark.parametrize("is_ended", [True, False])
-def test_a_log_has_events_as_they_become_known_and_at_the_end_by_tick(
-    tmp_path: Path, is_ended: bool
-) -> None:
+def test_a_log_is_sorted_by_tick_at_the_end(tmp_path: Path, is_ended: bool) -> None:
     path = tmp_path / "events.jsonl"
     log = EventLog(Display())
     log.open(path)

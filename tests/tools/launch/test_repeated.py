@@ -1,5 +1,4 @@
-"""A run, in real time too, is repeated in lockstep with what its operators
-commanded."""
+"""Tests that a run, also one in real time, is repeated in lockstep with its operators' commands."""
 
 from __future__ import annotations
 
@@ -32,7 +31,7 @@ HOLD = "level = 'upper', what = 'hold', tick = 40"
 
 
 class Commanding(Display):
-    """An operator who commands a running rack when it is seen to have reached a tick."""
+    """An operator who commands a running rack when it reaches certain ticks."""
 
     period_s = 0.02
 
@@ -48,7 +47,7 @@ class Commanding(Display):
 
 
 class ByHand(Display):
-    """An operator, waiting or under a lease, at a rack that is held before each command's tick."""
+    """An operator at a rack that is held before the tick of each command."""
 
     period_s = 0.01
 
@@ -94,8 +93,10 @@ def requests(config: RackConfig, **ticks: int) -> tuple[Request, ...]:
 
 
 def commanded(folder: Path, name: str, mode: str) -> Recording:
-    """Return a run of 2 s in which an operator commands what no config has: in lockstep at given
-    ticks, in real time whenever it comes."""
+    """Return a run of 2 s in which an operator gives commands that are not in the config.
+
+    In lockstep they are given at fixed ticks, in real time at any tick.
+    """
     file = folder / "commanded.toml"
     file.write_text(COMMANDED)
     settings = (f"name={name}", f"clock.mode={mode}", commands(HOLD))
@@ -110,7 +111,7 @@ def commanded(folder: Path, name: str, mode: str) -> Recording:
 
 
 def repeated(one: Recording, folder: Path, at: float = 0.0) -> Recording:
-    """Return the run that goes on from it."""
+    """Return the run that continues another run."""
     arguments = ("--from", f"{one.folder}@{at}", "--seconds", SECONDS, "--out", folder, "--json")
     done = rack("run", *arguments)
     assert not done.stderr
@@ -119,7 +120,7 @@ def repeated(one: Recording, folder: Path, at: float = 0.0) -> Recording:
 
 
 @pytest.mark.slow
-def test_what_an_operator_commanded_before_the_config_did_is_not_taken_for_that(
+def test_an_operators_command_is_not_mistaken_for_one_of_the_config(
     rack_name: str, tmp_path: Path
 ) -> None:
     file = tmp_path / "commanded.toml"
@@ -132,7 +133,7 @@ def test_what_an_operator_commanded_before_the_config_did_is_not_taken_for_that(
 
 @pytest.fixture(scope="module")
 def in_lockstep(tmp_path_factory: pytest.TempPathFactory) -> Recording:
-    """A run in lockstep whose operator commands what no config has."""
+    """A lockstep run whose operator gives commands that are not in the config."""
     return commanded(
         tmp_path_factory.mktemp("lockstep"), f"test-repeated-{os.getpid()}", "lockstep"
     )
@@ -140,7 +141,7 @@ def in_lockstep(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("at", "ticks"), [(0.0, [40, 80, 200]), (0.3, [200]), (1.2025, [])])
-def test_a_run_in_lockstep_goes_on_from_any_tick_with_its_operators_commands(
+def test_a_lockstep_run_continues_from_any_tick_with_its_operators_commands(
     in_lockstep: Recording, tmp_path: Path, at: float, ticks: list[int]
 ) -> None:
     two = repeated(in_lockstep, tmp_path / "two", at)
@@ -150,7 +151,9 @@ def test_a_run_in_lockstep_goes_on_from_any_tick_with_its_operators_commands(
 
 
 @pytest.mark.slow
-def test_the_commands_are_what_makes_it_equal(in_lockstep: Recording, tmp_path: Path) -> None:
+def test_a_repeated_run_without_the_commands_differs(
+    in_lockstep: Recording, tmp_path: Path
+) -> None:
     # The run's config has no command but the first one.
     again = load(in_lockstep.folder / "config.toml", [])
     assert [command.tick for command in again.command] == [40]
@@ -179,8 +182,7 @@ def test_a_run_in_real_time_is_repeated_equal_up_to_its_first_miss(
 
 @pytest.fixture(scope="module", params=[Client.WAITS, Client.LEASES])
 def by_hand(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Recording:
-    """A run in lockstep whose operator commands at 140 and 260
-    what no config has; under a lease these are in force to the end."""
+    """A lockstep run whose operator gives such commands at ticks 140 and 260, or leases them."""
     folder = tmp_path_factory.mktemp("by-hand")
     (folder / "commanded.toml").write_text(COMMANDED)
     name = f"test-by-hand-{os.getpid()}"
@@ -195,7 +197,7 @@ def by_hand(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
 
 
 def continued(one: Recording, at: float, folder: Path, *settings: str) -> Recording:
-    """Return the run that goes on from it, with nothing to note."""
+    """Return the run that continues another run without a note."""
     options = [option for setting in settings for option in ("--set", setting)]
     names = ("--from", f"{one.folder}@{at}", "--seconds", SECONDS, "--out", folder, "--json")
     done = rack("run", *names, *options)
@@ -207,7 +209,7 @@ def continued(one: Recording, at: float, folder: Path, *settings: str) -> Record
 @pytest.mark.parametrize(
     ("at", "ticks"), [(0.25, [140, 260]), (0.3, [140, 260]), (0.4, [260]), (0.6, [260]), (0.7, [])]
 )
-def test_what_operators_commanded_later_is_repeated(
+def test_later_commands_of_operators_are_repeated(
     by_hand: Recording, tmp_path: Path, at: float, ticks: list[int]
 ) -> None:
     two = continued(by_hand, at, tmp_path / "two")
@@ -229,7 +231,7 @@ def test_a_command_that_waits_in_a_snapshot_is_issued_once(
 
 
 @pytest.mark.slow
-def test_a_branch_has_its_own_commands_besides_those_repeated(
+def test_a_branch_adds_its_commands_to_the_repeated_ones(
     by_hand: Recording, tmp_path: Path
 ) -> None:
     earlier = "level = 'upper', what = 'hold', tick = 200"
@@ -238,7 +240,7 @@ def test_a_branch_has_its_own_commands_besides_those_repeated(
 
 
 @pytest.mark.slow
-def test_of_a_flight_recorder_commands_are_repeated_to_the_end_of_a_stretch(
+def test_commands_in_a_flight_recorder_are_repeated_to_the_end_of_a_stretch(
     by_hand: Recording,
 ) -> None:
     flight = Recording(by_hand.folder)
@@ -248,7 +250,7 @@ def test_of_a_flight_recorder_commands_are_repeated_to_the_end_of_a_stretch(
 
 
 @pytest.mark.slow
-def test_levels_that_write_the_name_of_their_rack_write_that_of_the_run(
+def test_a_repeated_rack_writes_the_name_of_the_original_rack(
     rack_name: str, tmp_path: Path
 ) -> None:
     # A servo level that waits to be enabled says by which command, with the rack's name.

@@ -1,4 +1,4 @@
-"""`rack command` on running racks: giving a command, waiting for the reply, and refusals."""
+"""Tests `rack command` on running racks: giving a command, waiting for the reply, and refusals."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.tools.command_line import BOUND_S, ROOT, rack
 
 
 def start(path: Path, name: str, *settings: str) -> subprocess.Popen[str]:
-    """Start a rack that runs until it is stopped; return when it does."""
+    """Start a rack that runs until it is stopped, and return when it runs."""
     path.write_text(COMMANDED.replace("commanded_levels:Lower", "commanded_levels:Homing"))
     given = [word for setting in (f"name={name}", *settings) for word in ("--set", setting)]
     command = [*RACK, "run", str(path), "--no-record", *given]
@@ -45,7 +45,7 @@ def end(process: subprocess.Popen[str], name: str) -> None:
 def running(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[str]:
-    """The name of a rack that runs until it is stopped."""
+    """Name of a rack that runs until it is stopped."""
     name = f"test-command-{request.param}-{os.getpid()}"
     process = start(
         tmp_path_factory.mktemp("rack") / "told.toml", name, f"clock.mode={request.param}"
@@ -71,7 +71,7 @@ def test_a_command_is_given_and_taken_up(running: str) -> None:
 
 
 @pytest.mark.slow
-def test_waiting_is_for_the_end_of_a_command_which_says_how_to_end_it(running: str) -> None:
+def test_waiting_lasts_until_the_command_is_done_and_tells_how_to_end_it(running: str) -> None:
     answer = json.loads(rack("command", running, "upper", "hold", "--wait", "--json").stdout)
     assert answer["fate"] == "done"
     # The level below has answered: two cycles later.
@@ -90,8 +90,7 @@ def test_waiting_is_for_the_end_of_a_command_which_says_how_to_end_it(running: s
 
 @contextmanager
 def waiting(name: str) -> Iterator[tuple[subprocess.Popen[str], int]]:
-    """A process that waits for the end of its command, whose serial is given, too: until the level
-    counts by nine."""
+    """A process that waits for the end of its command, and the serial of the command."""
     words = Segment.attach(name).words
     given = words[System.COMMANDED]
     command = [*RACK, "command", name, "lower", "goto", "home", "--wait", "--json"]
@@ -104,7 +103,7 @@ def waiting(name: str) -> Iterator[tuple[subprocess.Popen[str], int]]:
 
 
 @pytest.mark.slow
-def test_a_wait_goes_on_while_another_operator_sets_something(running: str) -> None:
+def test_a_wait_continues_while_another_operator_sets_a_parameter(running: str) -> None:
     with waiting(running) as (process, serial):
         assert rack("set", running, "board.lower.params.by=2").returncode == 0
         assert rack("command", running, "lower", "modify", "twice", "off").returncode == 0
@@ -117,7 +116,7 @@ def test_a_wait_goes_on_while_another_operator_sets_something(running: str) -> N
 
 
 @pytest.mark.slow
-def test_a_wait_ends_when_another_command_takes_its_place(running: str) -> None:
+def test_a_wait_ends_when_another_command_supersedes_its_command(running: str) -> None:
     with waiting(running) as (process, serial):
         assert rack("command", running, "lower", "resume").returncode == 0
         answer = json.loads(process.communicate(timeout=BOUND_S)[0])
@@ -126,7 +125,7 @@ def test_a_wait_ends_when_another_command_takes_its_place(running: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("gone", [signal.SIGKILL, signal.SIGSTOP])
-def test_a_level_holds_whose_operator_has_gone_within_a_lease(
+def test_a_level_holds_when_the_operator_of_a_lease_has_gone(
     running: str, gone: signal.Signals
 ) -> None:
     segment = Segment.attach(running)
@@ -155,7 +154,7 @@ def test_a_level_holds_whose_operator_has_gone_within_a_lease(
 
 
 @pytest.mark.slow
-def test_a_lease_ends_when_another_command_takes_its_place(running: str) -> None:
+def test_a_lease_ends_when_another_command_supersedes_it(running: str) -> None:
     segment = Segment.attach(running)
     upper = [*RACK, "command", running, "upper", "hold", "--lease"]
     with subprocess.Popen(upper, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
@@ -171,7 +170,7 @@ def test_a_lease_ends_when_another_command_takes_its_place(running: str) -> None
 
 
 @pytest.mark.slow
-def test_a_paused_rack_goes_on_from_there(running: str) -> None:
+def test_a_paused_rack_continues_from_its_tick(running: str) -> None:
     words = Segment.attach(running).words
     done = rack("pause", running, "--json")
     paused = json.loads(done.stdout)
@@ -186,7 +185,7 @@ def test_a_paused_rack_goes_on_from_there(running: str) -> None:
         tick = words[System.TICK]
         wait_until(lambda: words[System.TICK] > tick)
     done = rack("resume", running)
-    assert (done.returncode, done.stdout) == (0, f"rack '{running}' goes on\n")
+    assert (done.returncode, done.stdout) == (0, f"rack '{running}' continues\n")
     tick = words[System.TICK]
     wait_until(lambda: words[System.TICK] > tick)
     again = rack("resume", running)
@@ -204,7 +203,7 @@ def test_a_live_parameter_is_set_and_others_are_refused(running: str) -> None:
         f"{params}.bye=1": f"{params}.bye = 1: unknown key; did you mean 'by'?",
         f"{params}.label='x'": f'{params}.label = "x": it is read at the launch only; live parameters: by',
         f"{params}.by": 'name = "by": must be key=value, as in bandwidth=80',
-        "clock.speed=2": f"clock.speed=2: no level reads it while it runs; live: {params}.by",
+        "clock.speed=2": f"clock.speed=2: not a live parameter; valid keys: {params}.by",
     }.items():
         done = rack("set", running, setting)
         assert (done.returncode, done.stdout) == (2, "")
@@ -236,16 +235,16 @@ def test_a_parameter_set_on_a_held_rack_repeats_with_a_command_of_its_config(
 
 
 REFUSED = {
-    "upper resume --lease": "--lease: 'upper', resume: permitted: hold, ",
-    "upper hold --lease --wait": "--lease, --wait: a lease stays anyway",
+    "upper resume --lease": "--lease: 'upper', resume: must be one of hold, ",
+    "upper hold --lease --wait": "--lease and --wait: a lease waits anyway",
     "uper hold": 'level = "uper": no level of this name takes commands; levels that do: up',
     "upper hold --timeout 1": "--timeout needs --wait; give both, or neither",
     "upper": "LEVEL and WHAT are needed, as in: rack command ",
     "upper halt": "'enable', 'disable', 'reset' or 'release'",
     "lower setpoint joints=1": "'lower' does not take setpoint; it takes: hold, resume",
     "upper goto": "goal: missing; goto of 'upper' takes one of: home",
-    "upper goto hom": "'hom': not a goal; permitted: home, joints=..., position=...",
-    "upper goto joints=1,x": "'joints=1,x': 'x' is not a number; permitted: numbers separated by",
+    "upper goto hom": "'hom': not a goal; valid goals: home, joints=..., position=...",
+    "upper goto joints=1,x": "'joints=1,x': 'x' is not a number; numbers are separated by",
     "upper goto joints=1 joints=2": "'joints=2': joints is given twice",
     "upper hold --tick 0": "tick = 0: has passed; the rack is at tick ",
 }

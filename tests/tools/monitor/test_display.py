@@ -1,4 +1,4 @@
-"""Views of a running rack: the table, and the line for where there is no terminal."""
+"""Tests the views of a running rack: the table, and the line without a terminal."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ SHOWN: list[tuple[dict[str, Any], list[str], str]] = [
 
 
 @pytest.mark.parametrize(("changes", "lines", "end"), SHOWN)
-def test_table_and_line_show_what_holds_and_ails_the_rack(
+def test_table_and_line_show_holds_and_problems_of_the_rack(
     changes: dict[str, Any], lines: list[str], end: str
 ) -> None:
     snapshot = replace(SNAPSHOT, **changes)
@@ -105,7 +105,7 @@ def test_table_and_line_show_what_holds_and_ails_the_rack(
     assert not snapshot.holds or len(line_of(snapshot)) <= 90
 
 
-def test_a_display_tells_the_course_of_a_fault_and_leaves_misses_to_the_table(
+def test_a_display_shows_the_events_of_a_fault_but_no_misses(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     display = PlainDisplay()

@@ -1,4 +1,4 @@
-"""The full screen of `rack top`, on a rack in lockstep: what it shows, and what its keys do."""
+"""Tests the full screen of `rack top` on a rack in lockstep: its views and its keys."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 def on_screen(
     name: str, act: Callable[[Pilot[None]], Awaitable[None]], size: tuple[int, int] = (80, 24)
 ) -> None:
-    """Do something at the screen of a rack."""
+    """Run a function with the screen of a rack."""
 
     async def attached() -> None:
         with closing(Segment.attach(name)) as one:
@@ -46,7 +46,7 @@ def on_screen(
 
 
 def seen(pilot: Pilot[None]) -> str:
-    """Return what the screen shows."""
+    """Return the text of the screen."""
     return unescape(pilot.app.export_screenshot()).replace("\N{NO-BREAK SPACE}", " ")
 
 

@@ -1,4 +1,4 @@
-"""Holds of a rack, read from its memory: since when, why, and the command that releases it."""
+"""Tests holds of a rack, read from its segment: since when, why, and the releasing command."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def segment(tmp_path: Path, rack_name: str) -> Iterator[Segment]:
 
 
 def give(segment: Segment, *whats: Operation) -> None:
-    """Have an operator give `upper` commands, at ticks 100, 200, ..."""
+    """Let an operator give commands to `upper` at ticks 100, 200, ..."""
     writer = open_writer(segment, "upper.operator")
     for number, what in enumerate(whats, 1):
         writer.message.id, writer.message.what = number, what

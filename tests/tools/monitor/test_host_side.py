@@ -1,5 +1,4 @@
-"""The host side on the command line: a prompt, what status and check show, and replays of recorded
-entries."""
+"""Tests the host side on the command line: prompt, status, check, and replayed entries."""
 
 from __future__ import annotations
 
@@ -23,7 +22,7 @@ from tests.tools.command_line import rack
 
 @pytest.fixture
 def hosted(tmp_path: Path) -> Path:
-    """A rack with a host board, as a file."""
+    """A config file of a rack with a host board."""
     path = tmp_path / "hosted.toml"
     path.write_text(HOSTED)
     return path
@@ -54,7 +53,7 @@ def test_a_replay_of_recorded_entries_repeats_the_run_without_host_boards(
 
 
 @pytest.mark.slow
-def test_a_run_with_a_host_board_is_continued_with_what_that_sent(
+def test_a_run_with_a_host_board_is_continued_with_its_messages(
     tmp_path: Path, recorded: tuple[Path, dict[str, Any]]
 ) -> None:
     run, first = recorded
@@ -65,13 +64,13 @@ def test_a_run_with_a_host_board_is_continued_with_what_that_sent(
     done = rack("run", *asked.split(), "--out", tmp_path / "two", "--json")
     assert json.loads(done.stdout)["digest"] == first["digest"]
     assert done.stderr.splitlines() == [
-        f"{asked}: not started: 'program'; what they sent enters again",
+        f"{asked}: not started: 'program'; their recorded messages are replayed",
     ]
     two = Recording(tmp_path / "two")
     assert two.signal("bridge.numbers", "tick").min() >= tick
     refused = rack("run", *asked.split(), "--entries", run)
     assert (refused.returncode, refused.stderr.count("\n")) == (2, 1)
-    assert "a run that is continued has its own" in refused.stderr
+    assert "--from replays the entries anyway" in refused.stderr
 
 
 @pytest.mark.slow

@@ -1,5 +1,4 @@
-"""Interrupts as users see them: in `rack status`, in the report of a run, and message by
-message."""
+"""Tests interrupts in `rack status`, in the report of a run, and message by message."""
 
 from __future__ import annotations
 
@@ -19,8 +18,7 @@ from tests.tools.recordings import recorded as write_recording
 
 
 def recorded(folder: Path, name: str, *settings: str) -> Recording:
-    """Run the rack of tests of interrupts, and return its recording, without waiting for a recorder
-    to start."""
+    """Run the rack for these tests, and return its recording. No recorder process is started."""
     path = folder / "hub.toml"
     path.write_text(RACK)
     config = load(path, [f"name={name}", *settings])
@@ -33,7 +31,7 @@ def recorded(folder: Path, name: str, *settings: str) -> Recording:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("settings", [(SMALL,), (SMALL, OVERLOADED)], ids=["burst", "overload"])
-def test_a_recording_and_its_report_tell_what_the_board_itself_had(
+def test_recording_and_report_agree_with_the_inbox_of_the_board(
     tmp_path: Path, rack_name: str, settings: tuple[str, ...]
 ) -> None:
     recording = recorded(tmp_path, rack_name, *settings)

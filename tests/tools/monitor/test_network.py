@@ -1,5 +1,4 @@
-"""What users see of the network: the other racks, and what passes, of a running rack and in its
-report."""
+"""Tests the view of the network: other racks and exchanged messages, live and in a report."""
 
 from __future__ import annotations
 
@@ -50,7 +49,7 @@ COUNTS = {
 
 @pytest.fixture
 def segment(rack_name: str) -> Iterator[Segment]:
-    """The segment of a rack whose adapter has exchanged for a while."""
+    """Segment of a rack whose adapter has exchanged messages for a while."""
     config = loads(TEXT.replace('name = "one"', f'name = "{rack_name}"'))
     made = Segment.create(wire(config), config.text())
     status, peer = open_writer(made, "lan.status"), open_writer(made, "lan.peer_other_one")
@@ -82,7 +81,7 @@ def test_a_running_rack_shows_peers_imports_and_exports(segment: Segment) -> Non
 
 
 class Recorded:
-    """Stands in for a recording: three cycles of the adapter."""
+    """Stands in for a recording with three cycles of the adapter."""
 
     mailboxes = ("lan.status",)
 

@@ -1,4 +1,4 @@
-"""Queues as users see them: in `rack status`, in the report of a run, in `rack check`."""
+"""Tests queues in `rack status`, in the report of a run, and in `rack check`."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ FULL = ("protocol.depth={ 'upper.requests' = 7 }", "board.lower.params.most=2")
 
 
 @pytest.mark.slow
-def test_status_check_and_report_show_how_full_a_queue_is_and_what_it_refused(
+def test_status_check_and_report_show_fill_and_refusals_of_a_queue(
     tmp_path: Path, rack_name: str
 ) -> None:
     path = tmp_path / "queues.toml"

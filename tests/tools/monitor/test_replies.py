@@ -1,4 +1,4 @@
-"""The wait for the reply of a level to its operator's command."""
+"""Tests the wait for a level's reply to an operator's command."""
 
 from __future__ import annotations
 
@@ -11,9 +11,7 @@ from rack.tools.monitor.replies import REPLY_CYCLES, LastCycle
 from tests.boards.commanded_racks import COMMANDED
 
 
-def test_a_level_is_waited_for_by_its_cycles_and_not_for_ever(
-    tmp_path: Path, rack_name: str
-) -> None:
+def test_the_wait_for_a_level_is_bounded_by_its_cycles(tmp_path: Path, rack_name: str) -> None:
     (tmp_path / "told.toml").write_text(COMMANDED)
     layout = resolve(load(tmp_path / "told.toml", [f"name={rack_name}"])).layout
     segment = Segment.create(layout, "")
@@ -24,9 +22,11 @@ def test_a_level_is_waited_for_by_its_cycles_and_not_for_ever(
         block[Block.CYCLES] = REPLY_CYCLES
         assert last.passed(100) == ""
         block[Block.CYCLES] += 1
-        assert last.passed(101) == f"has not answered in {REPLY_CYCLES} of its cycles"
+        assert last.passed(101) == f"has not answered within {REPLY_CYCLES} cycles"
         stopped = LastCycle(segment, layout.mailbox("lower.status"))
         assert stopped.passed(101) == stopped.passed(501) == ""
-        assert stopped.passed(502) == "has not answered, and done no cycle since tick 101"
+        assert (
+            stopped.passed(502) == "has not answered, and has not completed a cycle since tick 101"
+        )
     finally:
         unlink(rack_name)

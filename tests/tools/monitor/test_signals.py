@@ -1,5 +1,4 @@
-"""Signals as they are written: none is missed, and those of several mailboxes are merged by
-tick."""
+"""Tests that no message of a signal is missed, and that signals are merged by tick."""
 
 from __future__ import annotations
 
@@ -27,7 +26,7 @@ def signals(link: Link) -> list[Signal]:
     return [Signal.of(f"{NAME}.{name}", boxes) for name in ("row[3]", "id")]
 
 
-def test_every_message_is_taken_once_and_what_is_overwritten_is_counted(
+def test_every_message_is_read_once_and_overwritten_ones_are_counted(
     link: Link, signals: list[Signal]
 ) -> None:
     tap = SignalTap(link.segment, signals)

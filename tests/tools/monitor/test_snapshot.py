@@ -1,5 +1,4 @@
-"""A look at a rack's memory: who is lost, who was restarted, what is demanded, which faults are
-active."""
+"""Tests snapshots of a rack's memory: lost and restarted boards, demands, active faults."""
 
 from __future__ import annotations
 
@@ -35,7 +34,7 @@ def segment(small: Path, rack_name: str) -> Iterator[Segment]:
 
 
 class Seen(Display):
-    """Keeps the states that `upper` was shown with."""
+    """Stores the states in which `upper` was shown."""
 
     period_s = 0.01
 
@@ -51,13 +50,13 @@ def row(segment: Segment, task: str) -> TaskRow:
     return next(row for row in RackMonitor(segment).look().tasks if row.task == task)
 
 
-def test_a_task_that_is_lost_says_so_whatever_its_status_says(segment: Segment) -> None:
+def test_a_lost_task_is_shown_as_lost_whatever_its_status(segment: Segment) -> None:
     segment.block("lower")[Block.LOST] = 41
     assert [row(segment, name).state for name in ("lower", "upper")] == ["lost", "absent"]
 
 
 @pytest.mark.parametrize(("number", "shown"), [(State.HOLDING, "holding"), (9, "absent")])
-def test_a_state_that_no_level_has_by_that_number_is_that_of_the_process(
+def test_an_unknown_state_number_shows_the_state_of_the_process(
     segment: Segment, number: int, shown: str
 ) -> None:
     writer = open_writer(segment, "upper.status")
@@ -69,7 +68,7 @@ def test_a_state_that_no_level_has_by_that_number_is_that_of_the_process(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("level", "own"), [("Stateless", set()), ("Reasonless", {"holding"})])
-def test_a_level_without_a_state_or_a_reason_in_its_status_runs_as_any_other(
+def test_a_level_without_state_or_reason_in_its_status_runs_normally(
     small: Path, rack_name: str, tmp_path: Path, level: str, own: set[str]
 ) -> None:
     settings = ["board.upper.ends_run=false", f"board.upper.executor=two_levels:{level}"]
@@ -81,7 +80,7 @@ def test_a_level_without_a_state_or_a_reason_in_its_status_runs_as_any_other(
     write_report(tmp_path / "run")
 
 
-def test_restarts_are_the_writers_that_came_after_the_first(segment: Segment) -> None:
+def test_restarts_count_the_writers_after_the_first(segment: Segment) -> None:
     assert row(segment, "lower").restarts == 0
     for _ in range(3):
         open_writer(segment, "lower.status").close()
@@ -89,7 +88,7 @@ def test_restarts_are_the_writers_that_came_after_the_first(segment: Segment) ->
     assert [row(segment, name).restarts for name in names] == [2, 0, 0]
 
 
-def test_active_faults_and_what_is_demanded_of_the_arm_are_shown(segment: Segment) -> None:
+def test_active_faults_and_the_demand_on_the_arm_are_shown(segment: Segment) -> None:
     entry = FaultTable(segment).entries[0]
     seen = []
     for stage in (Stage.WAITING, Stage.ACTIVE, Stage.OVER):

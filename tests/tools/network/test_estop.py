@@ -138,9 +138,9 @@ def test_a_remote_emergency_stop_is_reset_at_the_rack(far: Far) -> None:
 @pytest.mark.alone
 def test_nobody_can_stop_a_rack_without_a_right_or_a_terminal(far: Far) -> None:
     nobody = f"no rack '{far.name}' at {far.port}; racks there: none that knows 'nobody'; "
-    where = "it waits to stop a rack of another machine, HOST/RACK"
+    where = "--ready only stops a rack on another machine, HOST/RACK"
     peer = f"{far.name}-peer"
-    reset = f"rack '{far.name}' resets an emergency stop on its own machine alone"
+    reset = f"rack '{far.name}' can only be reset on its own machine"
     refused = {
         f"estop {far.address} --as nobody": (
             1,
@@ -153,13 +153,13 @@ def test_nobody_can_stop_a_rack_without_a_right_or_a_terminal(far: Far) -> None:
             " name it in adapter.lan.estop_from of the rack's config",
         ),
         f"estop {far.address} --reset": (1, f"{reset}: rack estop {far.name} --reset"),
-        f"estop {far.address} --ready": (1, "stdin has ended, and no stop was set"),
+        f"estop {far.address} --ready": (1, "stdin has ended before a stop was set"),
         f"estop {far.name} --ready": (2, f"--ready, {far.name}: {where}"),
         f"estop {far.address} --ready --reset": (2, f"--ready, --reset: {where}"),
         f"status {far.address}": (
             2,
-            f"RACK = {far.address}: this command works on the rack's own machine alone, as in:"
-            " ssh HOST rack status; from another machine only: rack estop",
+            f"RACK = {far.address}: run this command on the rack's machine, as in:"
+            " ssh HOST rack status; only 'rack estop' works from another machine",
         ),
     }
     ended = afar(*refused)
@@ -238,7 +238,7 @@ def test_a_ready_operator_is_told_when_the_run_ends(far: Far) -> None:
 def test_an_unreachable_host_is_reported_in_one_line(tmp_path: Path) -> None:
     port = free_port()
     make_credentials(tmp_path / "certs", {"cell": []}, 1)
-    why = "not a rack; permitted: RACK, or HOST[:PORT]/RACK, as in 10.0.0.5/cell"
+    why = "must be RACK or HOST[:PORT]/RACK, as in 10.0.0.5/cell"
     with socket.create_server(("127.0.0.1", 0)) as server:
         open_port = server.getsockname()[1]
         ended = afar(
@@ -255,7 +255,7 @@ def test_an_unreachable_host_is_reported_in_one_line(tmp_path: Path) -> None:
         f"127.0.0.1:{port}: cannot connect to port {port}: Connection refused",
         f'RACK = "127.0.0.1:99999/x": {why}',
         f'RACK = "127.0.0.1/X!": {why}',
-        ('--as = "X!": not a name; permitted: small letters, digits, "-" and "_", at most 40'),
+        '--as = "X!": must be at most 40 small letters, digits, "-" and "_"',
         missing,
     ]
 

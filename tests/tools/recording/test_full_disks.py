@@ -62,7 +62,9 @@ def test_a_full_disk_under_the_events_ends_no_run(config: RackConfig, tmp_path: 
     (folder / "events.jsonl").symlink_to("/dev/full")
     result = run_rack(config, 0.5, folder, display)
     assert (result.outcome.worked, result.worked) == (True, False)
-    assert result.failure().endswith("not all is recorded: events.jsonl ends before the run")
+    assert result.failure().endswith(
+        "the recording is incomplete: events.jsonl ends before the run"
+    )
     assert display.texts.count("events.jsonl ends here: No space left on device") == 1
 
 

@@ -242,7 +242,7 @@ def test_the_command_prints_the_chain_and_refuses_what_cannot_be_compared(
         ((*against, tmp_path), "not a run"),
         ((*against, _losing(two)), "lost 3 rows; the two runs cannot be compared"),
         ((*against, two.folder, "--of", "wave.statu"), "nearest: wave.status"),
-        ((one.folder, "--of", "wave.status"), "permitted with --against"),
+        ((one.folder, "--of", "wave.status"), "need --against"),
     ):
         refused = rack("report", *arguments)
         assert (refused.returncode, refused.stderr.count("\n")) == (2, 1), refused.stderr

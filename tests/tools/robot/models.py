@@ -30,8 +30,12 @@ def joint(
 
 
 def urdf(gripper: bool = True, effort: float = 60.0, mimics: bool = True, jaw: bool = False) -> str:
-    """Return an arm of six joints; with a gripper, of two fingers of which one mimics the other, or
-    does not, or of one that turns towards a `jaw`."""
+    """Return an arm of six joints as URDF.
+
+    With `gripper` it has two fingers, of which one mimics the other if `mimics`. With `jaw` it has
+    one
+    finger that turns towards a fixed jaw instead.
+    """
     parts = [link("base", "0.1 0.1 0.1", "0 0 0")]
     parent = "base"
     below = 0.05

@@ -1,4 +1,4 @@
-"""Which joints of a model are the arm's, which are passive, and what is done with the rest."""
+"""Tests which joints of a model form the arm, which are passive, and what happens to the rest."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SPRING = 'stiffness="20" damping=".2"'
 
 
 def rod(name: str, inner: str = "", spring: str = SPRING) -> str:
-    """Return a light body on a hinge named so."""
+    """Return a light body on a hinge with this name."""
     return (
         f'<body name="{name} body" pos="0 0 .06"><joint name="{name}" axis="1 0 0" {spring}/>'
         f'<geom type="capsule" size=".008" fromto="0 0 .012 0 0 .04" mass=".01"/>{inner}</body>'
@@ -89,7 +89,7 @@ def test_the_arm_ends_at_its_last_driven_joint(
     assert (arm.joints, arm.fingers, arm.passive) == (joints, fingers, passive)
 
 
-def test_joints_that_are_named_are_driven(tmp_path: Path) -> None:
+def test_named_joints_are_driven(tmp_path: Path) -> None:
     arm = found(tmp_path, FLEXIBLE, joints=(*JOINTS, "flex1"))
     assert arm.joints == (*JOINTS, "flex1")
     assert arm.passive == ("flex2",)
@@ -99,14 +99,14 @@ def test_joints_that_are_named_are_driven(tmp_path: Path) -> None:
     ("text", "tip", "names"),
     [(without_motor("elbow"), "", "elbow"), (FLEXIBLE, "flex2 body", "flex1, flex2")],
 )
-def test_a_passive_joint_within_the_arm_is_refused_with_what_to_do(
+def test_a_passive_joint_within_the_arm_is_refused_with_advice(
     tmp_path: Path, text: str, tip: str, names: str
 ) -> None:
     with pytest.raises(RobotError, match=rf"nothing drives {names}, .* --tip .* --joints"):
         found(tmp_path, text, tip)
 
 
-def test_an_arm_of_too_many_joints_is_refused_with_what_to_do(tmp_path: Path) -> None:
+def test_an_arm_with_too_many_joints_is_refused_with_advice(tmp_path: Path) -> None:
     inner = ""
     for number in range(12, 0, -1):
         inner = rod(f"snake{number}", inner, spring='range="-1 1"')
@@ -125,7 +125,9 @@ def test_springs_stay_springs_and_other_passive_joints_are_held(tmp_path: Path) 
     assert set(names) == {*JOINTS, "flex1"}
     assert model.joint("flex1").stiffness[0] == 20.0
     assert model.nu == len(JOINTS)
-    assert any(note.startswith("passive, beyond the arm: flex1, loose;") for note in made.notes)
+    assert any(
+        note.startswith("passive joints beyond the arm: flex1, loose;") for note in made.notes
+    )
 
 
 BASE = 'inertia ixx="{}" iyy="0.01" izz="0.01" ixy="{}"'
@@ -146,7 +148,7 @@ def test_the_inertia_of_a_base_that_never_moves_does_not_matter(tmp_path: Path, 
     name = "arm.xml" if case == "MJCF" else "arm.urdf"
     source = read_source(written(tmp_path, text, name))
     assert source.compiled().nbody > len(JOINTS)
-    assert "inertias that no body can have are balanced" not in source.notes
+    assert "physically impossible inertias were balanced" not in source.notes
 
 
 def test_the_inertia_of_a_body_that_moves_is_still_refused(tmp_path: Path) -> None:
@@ -161,20 +163,20 @@ LIMITS = 'lower="-2.8" upper="2.8"'
 
 @pytest.mark.slow
 @pytest.mark.parametrize("limits", ['lower="0" upper="0"', "", 'lower="2" upper="-2"'])
-def test_a_range_that_is_none_is_said_and_mujoco_prints_nothing(
+def test_an_invalid_range_is_reported_and_mujoco_prints_nothing(
     tmp_path: Path, limits: str, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     source = read_source(written(tmp_path, urdf(gripper=False).replace(LIMITS, limits, 3)))
     made = draft(source, Wishes(), tmp_path, "drafted")
-    assert "without limits: j1, j2, j3; [robot] position can state them" in made.notes
+    assert "joints without limits: j1, j2, j3; [robot] position can state them" in made.notes
     assert capfd.readouterr() == ("", "")
     assert not (tmp_path / "MUJOCO_LOG.TXT").exists()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("effort", ["inf", "1e12"])
-def test_an_effort_without_bound_is_none_and_torques_are_guessed(
+def test_an_infinite_effort_counts_as_unstated_and_torques_are_guessed(
     tmp_path: Path, effort: str
 ) -> None:
     text = urdf(gripper=False).replace('effort="60.0"', f'effort="{effort}"')

@@ -1,4 +1,4 @@
-"""What `rack robot new` finds for an arm to do."""
+"""Tests the tasks that `rack robot new` finds for an arm."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`rack robot check`: what is wrong with an arm is seen before it moves."""
+"""Tests `rack robot check`: problems of an arm are found before it moves."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def failing(found: dict[str, Any]) -> dict[str, str]:
     return {one["about"]: one["text"] for one in found["findings"] if one["fails"]}
 
 
-def test_a_sound_arm_passes_with_its_axes_and_what_it_can_do(tmp_path: Path) -> None:
+def test_a_good_arm_passes_with_its_axes_and_abilities(tmp_path: Path) -> None:
     found = checked(tmp_path, EXAMPLE, 0)
     assert [row["axis"] for row in found["joints"]][:2] == [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]]
     assert found["reach_m"] == pytest.approx(0.97, abs=0.01)
@@ -35,7 +35,7 @@ def test_a_sound_arm_passes_with_its_axes_and_what_it_can_do(tmp_path: Path) -> 
     assert is_drawn or "OpenGL" in found["picture"]
 
 
-def test_contacts_at_home_bodies_that_nothing_holds_and_endless_falls_fail(tmp_path: Path) -> None:
+def test_contacts_at_home_unattached_bodies_and_endless_falls_fail(tmp_path: Path) -> None:
     model = EXAMPLE.with_name("desk-arm.xml").read_text()
     loose = '<body name="flap" pos="0 2 1"><joint axis="0 1 0"/><geom size=".05"/></body>'
     cup = '<body name="cup" pos="5 5 1"><freejoint/><geom size=".02"/></body>'
@@ -45,12 +45,12 @@ def test_contacts_at_home_bodies_that_nothing_holds_and_endless_falls_fail(tmp_p
     text = text.replace("home = [0.0, -0.6", "home = [0.0, 1.2")
     found = failing(checked(tmp_path, written(tmp_path, text, "own.toml"), 1))
     assert "desk" in found["contacts at home"] or "world" in found["contacts at home"]
-    assert found["bodies that nothing holds"] == "flap"
+    assert found["unattached bodies"] == "flap"
     assert found["objects"] == "'cup' falls without end"
 
 
 @pytest.mark.parametrize("name", ["a.xml", "a.sdf"])
-def test_what_is_no_model_has_exit_status_2_and_a_line_that_names_what_is_read(
+def test_a_file_that_is_not_a_model_is_refused_with_valid_formats(
     name: str, tmp_path: Path
 ) -> None:
     done = rack("robot", "check", written(tmp_path, "<sdf/>", name), folder=tmp_path)

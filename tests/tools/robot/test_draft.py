@@ -1,4 +1,4 @@
-"""What `rack robot new` makes of an arm's joints."""
+"""Tests the limits and loops that `rack robot new` chooses for an arm's joints."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def with_friction(text: str) -> str:
 
 
 @pytest.mark.slow
-def test_dry_friction_of_light_links_is_what_the_equation_of_motion_says(tmp_path: Path) -> None:
+def test_dry_friction_of_light_links_follows_the_equation_of_motion(tmp_path: Path) -> None:
     source = read_source(written(tmp_path, with_friction(urdf(gripper=False))))
     made = draft(source, Wishes(), tmp_path, "drafted")
     assert "dry friction acts within 1 ms" in made.notes
@@ -51,7 +51,7 @@ def test_a_loop_is_stiff_enough_for_joints_to_rest_at_their_goals(
 ) -> None:
     model = with_friction(urdf(gripper=False)).replace(str(DRY_N_M), str(friction))
     made = draft(read_source(written(tmp_path, model)), Wishes(), tmp_path, "drafted")
-    assert made.bandwidth == bandwidth
+    assert made.limits.bandwidth == bandwidth
     text = config_text(made, Assignment(NOTHING, [], "nothing"), "drafted", made.model)
     assert tomllib.loads(text).get("board", {}) == (
         {"servo": {"params": {"bandwidth": bandwidth}}} if bandwidth else {}

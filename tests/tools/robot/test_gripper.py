@@ -1,4 +1,4 @@
-"""What `rack robot new` makes of grippers: one drive, and what follows it."""
+"""Tests the grippers that `rack robot new` drafts: one drive and its followers."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def gripper_of(made: Draft) -> GripperConfig:
     return made.robot.gripper
 
 
-def test_a_finger_that_nothing_couples_follows_and_that_is_a_guess(tmp_path: Path) -> None:
+def test_an_uncoupled_finger_follows_as_a_guess(tmp_path: Path) -> None:
     made = drafted(tmp_path, written(tmp_path, urdf(mimics=False)))
     assert gripper_of(made).follow == (FollowConfig(joint="right_finger", ratio=1.0),)
     assert "right_finger follow" in made.guessed["gripper"]
@@ -46,25 +46,26 @@ def test_a_single_finger_closes_on_its_jaw_with_the_tool_next_to_that(tmp_path: 
     made = drafted(tmp_path, robot.model)
     gripper = gripper_of(made)
     assert (gripper.joint, gripper.open, gripper.closed) == ("finger_left", 0.04, -0.035)
-    assert made.jaws is not None
-    assert made.jaws.is_one
+    assert made.gripper is not None
+    fingertips = made.gripper.fingertips
+    assert fingertips.is_one
     # The jaw is at y = -35 mm of the hand, the finger opens 75 mm from it.
-    assert made.jaws.block == pytest.approx(0.35 * 0.075)
-    assert made.jaws.tool.position[1] == pytest.approx(-0.035 + 0.5 * made.jaws.block, abs=1e-4)
+    assert fingertips.block == pytest.approx(0.35 * 0.075)
+    assert fingertips.tool.position[1] == pytest.approx(-0.035 + 0.5 * fingertips.block, abs=1e-4)
     assert "finger and fixed jaw" in made.guessed["tool"]
 
 
-def test_a_finger_that_meets_nothing_is_held_and_the_reason_said(tmp_path: Path) -> None:
+def test_a_finger_that_meets_nothing_is_fixed_with_a_note(tmp_path: Path) -> None:
     robot, _ = grippers.one_finger(tmp_path)
     model = tmp_path / "puma560.xml"
     model.write_text(model.read_text().replace(grippers.FIXED, ""))
     made = drafted(tmp_path, robot.model)
     assert made.robot.gripper is None
-    assert "no gripper: fingers that do not close on each other, nor on a jaw" in made.notes
+    assert "no gripper: the fingers close neither on each other nor on a jaw" in made.notes
     assert [joint.name for joint in made.spec.joints] == list(made.robot.joints)
 
 
-def test_a_gripper_that_its_own_arm_keeps_from_closing_is_held(tmp_path: Path) -> None:
+def test_a_gripper_that_its_arm_blocks_is_fixed(tmp_path: Path) -> None:
     robot, _ = grippers.soft(tmp_path)
     model = tmp_path / "puma560.xml"
     # Of the link before the last: MuJoCo lets fingers and the hand that carries them overlap.

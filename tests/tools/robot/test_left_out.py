@@ -1,4 +1,4 @@
-"""Whatever refers to bodies of a model that are left out is left out as well."""
+"""Tests that elements which refer to removed bodies of a model are removed as well."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ KEPT = (
 
 
 def held(folder: Path, inside: str = "", outside: str = "") -> mujoco.MjModel:
-    """Return a model of which all but its arm was held."""
+    """Return a model in which everything except its arm was fixed."""
     text = MODEL.format(inside=inside, outside=outside)
     spec = load_spec(written(folder, text, "given.xml"))
     spec.compile()
@@ -75,7 +75,7 @@ def held(folder: Path, inside: str = "", outside: str = "") -> mujoco.MjModel:
 
 
 @pytest.mark.parametrize("case", GONE)
-def test_whatever_refers_to_a_body_that_is_left_out_is_left_out(tmp_path: Path, case: str) -> None:
+def test_elements_that_refer_to_a_removed_body_are_removed(tmp_path: Path, case: str) -> None:
     text = GONE[case]
     is_inside = case in ("camera", "light")
     model = held(tmp_path, text if is_inside else "", "" if is_inside else text)
@@ -84,7 +84,7 @@ def test_whatever_refers_to_a_body_that_is_left_out_is_left_out(tmp_path: Path, 
     assert found == dict.fromkeys(found, 0) | {"njnt": 1}
 
 
-def test_what_has_the_name_of_something_else_that_is_left_out_stays(tmp_path: Path) -> None:
+def test_an_element_with_the_name_of_a_removed_one_of_another_kind_stays(tmp_path: Path) -> None:
     model = held(tmp_path, outside=KEPT)
     assert (model.ntendon, model.nu, model.nsensor, model.ntuple) == (1, 1, 2, 1)
 

@@ -1,4 +1,4 @@
-"""`rack robot new`: from a model file to an arm that moves, with nothing edited."""
+"""Tests `rack robot new`: from a model file to an arm that moves, without editing."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ LEVER = link("lever", "0.01 0.01 0.01", "0 0 0") + joint(
 
 
 def follows(leader: str) -> str:
-    """Return an arm of which the third joint mimics another one."""
+    """Return an arm whose third joint mimics another one."""
     third = '<joint name="j3" type="revolute">'
     return urdf().replace(third, f'{third}<mimic joint="{leader}"/>')
 
@@ -74,7 +74,7 @@ def test_a_urdf_transfers_two_blocks_with_nothing_edited(tmp_path: Path, has_jaw
 
 
 @pytest.mark.slow
-def test_what_the_urdf_states_is_taken_and_the_rest_named_as_guessed(small: Path) -> None:
+def test_values_of_the_urdf_are_used_and_the_others_named_as_guesses(small: Path) -> None:
     text = (small / "small" / "small.toml").read_text()
     robot = tomllib.loads(text)["robot"]
     assert robot["joints"] == ["j1", "j2", "j3", "j4", "j5", "j6"]
@@ -88,12 +88,12 @@ def test_what_the_urdf_states_is_taken_and_the_rest_named_as_guessed(small: Path
     assert "\nhome = " in text
     assert "# guessed: free of contact" in text
     again = rack("robot", "new", small / "small.urdf", folder=small)
-    assert (again.returncode, "'small' is there already" in again.stderr) == (2, True)
+    assert (again.returncode, "'small' exists already" in again.stderr) == (2, True)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("text", "why"), BAD.values(), ids=BAD)
-def test_a_bad_model_is_one_line_and_nothing_is_written(
+def test_a_bad_model_is_refused_in_one_line_and_nothing_is_written(
     tmp_path: Path, text: str, why: str
 ) -> None:
     model = written(tmp_path, text)
@@ -107,12 +107,12 @@ def test_a_bad_model_is_one_line_and_nothing_is_written(
 @pytest.mark.parametrize(
     ("name", "better"), [("nasrem", "nasrem-arm"), ("A b", "a-b"), ("..", "arm"), ("-x", "x")]
 )
-def test_a_name_that_rack_run_would_refuse_is_refused_with_one_that_serves(
+def test_an_invalid_name_is_refused_with_a_valid_one(
     tmp_path: Path, name: str, better: str
 ) -> None:
     done = rack("robot", "new", DESK_ARM, f"--name={name}", "--out", "new", folder=tmp_path)
     assert (done.returncode, list(tmp_path.iterdir())) == (2, [])
-    assert done.stderr.startswith(f"--name = {name}: permitted")
+    assert done.stderr.startswith(f"--name = {name}: must be")
     assert done.stderr.endswith(f"; for example {better}\n")
 
 
@@ -145,7 +145,7 @@ def test_the_command_that_it_prints_finds_the_new_rack(
 
 
 @pytest.mark.slow
-def test_an_arm_without_gripper_tours_and_keeps_what_was_said(tmp_path: Path) -> None:
+def test_an_arm_without_gripper_tours_and_keeps_the_options(tmp_path: Path) -> None:
     home = "0,-0.6,1.8,0,1.9416,0"
     words = ("--name", "desk", "--home", home, "--gripper", "none")
     done = rack("robot", "new", DESK_ARM, *words, folder=tmp_path)
@@ -161,7 +161,7 @@ def test_an_arm_without_gripper_tours_and_keeps_what_was_said(tmp_path: Path) ->
 
 
 @pytest.mark.slow
-def test_of_two_arms_one_is_held_and_what_flies_is_left_out(tmp_path: Path) -> None:
+def test_the_second_arm_is_fixed_and_free_bodies_are_left_out(tmp_path: Path) -> None:
     text = DESK_ARM.read_text()
     arm = text[text.index('<body name="turret"') : text.index("</worldbody>")]
     second = arm.replace('name="', 'name="second_').replace('pos="0 0 .18"', 'pos="0 1.5 .18"')
@@ -180,7 +180,7 @@ def test_of_two_arms_one_is_held_and_what_flies_is_left_out(tmp_path: Path) -> N
 
 
 @pytest.mark.slow
-def test_on_a_terminal_it_asks_for_what_no_option_says(tmp_path: Path) -> None:
+def test_the_command_asks_on_a_terminal_for_values_that_no_option_gives(tmp_path: Path) -> None:
     arm = written(tmp_path, urdf())
     pid, terminal = pty.fork()
     if pid == 0:

@@ -1,5 +1,4 @@
-"""Meshes in convex pieces: a bend that a hull fills is free in the pieces, and what is solid stays
-so."""
+"""Tests convex pieces of meshes: a bend that a hull would fill is free, and solid parts stay."""
 
 from __future__ import annotations
 
@@ -36,7 +35,7 @@ def jaw() -> str:
 
 
 def distance(model: mujoco.MjModel, place: tuple[float, float], prefix: str) -> float:
-    """Return the distance of a place in the jaw's frame from solid meshes, m."""
+    """Return the distance, m, of a point in the frame of the jaw from solid meshes."""
     data = mujoco.MjData(model)
     probe = model.geom("probe").id
     mujoco.mj_forward(model, data)

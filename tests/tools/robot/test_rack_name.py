@@ -1,4 +1,4 @@
-"""Names of racks: one rule, and the names that are made by it."""
+"""Tests the rule for names of racks, and the names derived by it."""
 
 from __future__ import annotations
 

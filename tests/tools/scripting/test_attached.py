@@ -1,4 +1,4 @@
-"""A rack that runs in the background of a program, and what attaches to it reads and commands."""
+"""Tests reading and commanding a rack that runs in the background of a program."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_a_rack_runs_while_its_program_reads_and_commands(own: Rack, live: Attac
 
 
 @pytest.mark.slow
-def test_what_goes_wrong_is_the_line_of_the_command(own: Rack, live: AttachedRack) -> None:
+def test_errors_have_the_text_of_the_command(own: Rack, live: AttachedRack) -> None:
     with pytest.raises(rack.Failure, match=r"refused at tick .*: the way home is closed$"):
         live.command("upper", "goto", home=True)
     cases: dict[str, Callable[[], object]] = {
@@ -87,7 +87,7 @@ def test_what_goes_wrong_is_the_line_of_the_command(own: Rack, live: AttachedRac
         "lower.statsu: no such mailbox; nearest: lower": lambda: live.read("lower.statsu"),
         "detection: not within 0 s$": lambda: live.wait_for("detection", 0.0),
         "< 0: not within 0 s$": lambda: live.wait_until("lower.status.count < 0", 0.0),
-        "by=2: no level reads it while it runs": lambda: live.set("board.upper.params.by", 2),
+        "by=2: not a live parameter": lambda: live.set("board.upper.params.by", 2),
         '^kind = "kil"': lambda: live.inject("lower", "kil"),
         "^rack 'no-such-rack' does not exist": lambda: rack.attach("no-such-rack"),
     }
@@ -151,7 +151,7 @@ def test_a_program_that_is_interrupted_or_ends_leaves_nothing(
     wait_until(lambda: not named(f"{rack_name}:"))
 
 
-def test_a_clock_that_nobody_started_is_waited_for_in_vain(path: Path, rack_name: str) -> None:
+def test_waiting_for_a_clock_that_was_not_started_fails(path: Path, rack_name: str) -> None:
     with (
         Rack.from_file(path, [f"name={rack_name}", "clock.mode=lockstep"]),
         rack.attach(rack_name) as live,

@@ -1,4 +1,4 @@
-"""A rack that a program launches: its settings, and its recording, which is that of `rack run`."""
+"""Tests a rack that a program launches: its settings, and its recording, equal to `rack run`'s."""
 
 from __future__ import annotations
 

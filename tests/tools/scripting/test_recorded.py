@@ -1,4 +1,4 @@
-"""A run read back by a program: signals, tables, events and report."""
+"""Tests reading a run from a program: signals, tables, events and report."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_a_signal_is_an_array_with_its_ticks_and_unit(
     assert len(levels) == len(run.signals["task.status.state"].ticks)
 
 
-def test_a_run_at_a_time_has_the_messages_that_are_read_there(small: Path) -> None:
+def test_a_run_at_a_time_has_the_messages_that_tasks_read_then(small: Path) -> None:
     moment = rack.open_run(small).at(1.2)
     assert (moment.tick, moment.time_s) == (480, 1.2)
     status = rack.open_run(small).signals["lower.status.count"]
@@ -60,7 +60,7 @@ def test_a_run_at_a_time_has_the_messages_that_are_read_there(small: Path) -> No
     assert {"lower.status", "upper.command", "lower.plan"} <= set(moment.mailboxes)
     with pytest.raises(rack.Failure, match=r"no message yet at 0 s"):
         rack.open_run(small).at(0).read("lower.status")
-    with pytest.raises(rack.Failure, match=r"^4\.1: permitted: 0 to 3\.9975 s$"):
+    with pytest.raises(rack.Failure, match=r"^4\.1: must be 0 to 3\.9975 s$"):
         rack.open_run(small).at(4.1)
 
 
@@ -89,7 +89,7 @@ def test_events_and_report_are_those_of_the_run(small: Path) -> None:
     assert (small / "report.json").is_file()
 
 
-def test_runs_and_signals_say_what_they_are(small: Path) -> None:
+def test_runs_and_signals_describe_themselves(small: Path) -> None:
     run = rack.open_run(small)
     name = run._recording.layout.rack
     ends = f"time over, {len(run.signals)} signals>"
@@ -129,7 +129,9 @@ def test_a_plot_has_units_names_and_marks(small: Path, tmp_path: Path) -> None:
     state = signals["lower.status.state"].plot(pyplot.figure().add_subplot())
     assert "executing" in [label.get_text() for label in state.get_yticklabels()]
     pyplot.close("all")
-    with pytest.raises(rack.Failure, match=r"^lower\.status\.reason: text; a plot needs numbers"):
+    with pytest.raises(
+        rack.Failure, match=r"^lower\.status\.reason: is a text; only numbers can be plotted"
+    ):
         signals["lower.status.reason"].plot()
 
 

@@ -10,12 +10,12 @@
     run = rack.open_run("run")
     run.signals["servo.status.position"].plot()
 
-- `Rack` launches the boards of a config, and may record them; `attach` reads and commands a rack
-  that is running, of any program; `open_run` reads what `rack run` or `rack record` left.
-- `Failure` is what goes wrong with them; its text is that of the command. `ConfigError` is the one
-  that lists the mistakes of a config.
+- `Rack` launches the boards of a config, and can record them. `attach` reads and commands a running
+  rack, whichever program launched it. `open_run` reads a folder of `rack run` or `rack record`.
+- `Failure` is raised when any of them fails, with the same text as the command. Its subclass
+  `ConfigError` lists the mistakes of a config.
 
-Names are imported on first use: to import `rack` costs nothing.
+Names are imported on first use, so that importing `rack` costs nothing.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-# In a checkout this file and the floors are links in .venv: their files are where these lead.
+# In a checkout this file and the packages are links in .venv, so resolve them.
 __path__ = [
     str(Path(__file__).with_name("backplane").resolve().parent),
     str(Path(__file__).resolve().parent),
@@ -45,7 +45,8 @@ _PLACES = {
     "rack.tools.scripting.recorded": ("open_run",),
 }
 
-if not TYPE_CHECKING:  # a type checker would take every misspelt name for one of these
+# Hidden from type checkers, which would otherwise accept every misspelt name.
+if not TYPE_CHECKING:
     __getattr__ = on_first_use(__name__, _PLACES)
 
 
