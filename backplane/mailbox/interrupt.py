@@ -207,10 +207,7 @@ class InterruptReader(Reader):
         """Return the newest message served by the release at `tick`, with its verdict."""
         self.accesses += 1
         self._inbox.advance(tick)
-        self.found = serial = self._line.found
-        if serial == self.serial:
-            return self._unchanged
-        return self._new if self._obtain(serial) else self._take_older(serial, tick)
+        return self._take(self._line.found, tick)
 
     def _step_back(self, serial: int, tick: int) -> Reading[AnyMessage]:
         """Take the newest good message that was served before a lost, damaged or forged one, if it

@@ -17,19 +17,17 @@ import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from struct import Struct
 from typing import Generic, NamedTuple, TypeVar
 from weakref import WeakSet
 
+from rack.backplane.address_map import SLOT_HEAD_SIZE
 from rack.backplane.byte_lock import ByteLock
 from rack.backplane.errors import MailboxError
 from rack.backplane.mailbox.slots import Slots, claim, epoch_of, pid_of
 from rack.backplane.message import AnyMessage, Message
 from rack.backplane.segment import Segment
-from rack.backplane.words import Box, Slot, Word
+from rack.backplane.words import Box, Word
 
-# Signature, basis, tick and visibility: see `words.Slot`.
-_HEAD = Struct("@8xq16xq8x2q").unpack_from
 NOT_YET = 1 << 62
 """Tick of the newest message before there is one: its age is negative, so it is never too old."""
 MAX_STEP_BACK = 4
@@ -192,20 +190,14 @@ class ReadStatistics:
     lost: int = 0  # of a queue: serials without a message
 
 
-class ReaderState:
-    """Words of a reader's state: private memory, which compiled reads share with the reader."""
-
-    SERIAL = 0
-    FOUND = 1
-    NEWEST = 2
-    VISIBLE = 3
-    BASIS = 4
-    ACCESSES = 5
-    TRANSFERS = 6
-    SIGNATURE = 7  # of the writer of the last good message
-    JUDGED = 8  # of the reader's `MessageWatch`: serial of the newest message judged
-    JUDGED_TICK = 9  # and its release tick
-    COUNT = 10
+# A reader's state is private memory that the reader shares with compiled code. It consists of five
+# words and the last good message with its head: see `words.Slot`.
+JUDGED = 3
+"""Word of a reader's state: serial of the newest message that its `MessageWatch` has judged."""
+JUDGED_TICK = 4
+"""Word of a reader's state: release tick of that message."""
+GOOD = 40
+"""Offset of the last good message in a reader's state, bytes."""
 
 
 class Reader:
@@ -220,34 +212,31 @@ class Reader:
         basis: Tick of the oldest information on which the last good message depends.
         accesses: Reads so far.
         transfers: Messages copied so far.
-        words: The state of the reader, with all of these: see `ReaderState`.
+        words: The words of the state, which contain all of these.
     """
 
-    serial = Word(ReaderState.SERIAL)
-    found = Word(ReaderState.FOUND)
-    newest = Word(ReaderState.NEWEST)
-    visible = Word(ReaderState.VISIBLE)
-    basis = Word(ReaderState.BASIS)
-    accesses = Word(ReaderState.ACCESSES)
-    transfers = Word(ReaderState.TRANSFERS)
-    _signature = Word(ReaderState.SIGNATURE)
+    found = Word(0)
+    accesses = Word(1)
+    transfers = Word(2)
+    _signature = Word(6)
+    basis = Word(9)
+    serial = Word(10)
+    newest = Word(11)
+    visible = Word(12)
 
     def __init__(self, segment: Segment, name: str) -> None:
         self.spec = segment.layout.mailbox(name)
         self.slots = slots = Slots(segment, self.spec)
-        self._box = slots.box
-        self._heads = slots.heads
-        self._mask = slots.mask
-        self._depth = slots.depth
         # The last good message has its own buffer: a corrupt copy never reaches it.
-        good = Slots(segment, self.spec)
+        state = memoryview(bytearray(GOOD + len(slots.record)))
+        good = Slots(segment, self.spec, state[GOOD:])
         self.good = good.record
         """The last good message, with the head of its slot."""
         self.message = good.message
         self._readings = {verdict: Reading(self.message, verdict) for verdict in Verdict}
         self._new = self._readings[Verdict.NEW]
         self._unchanged = self._readings[Verdict.NONE]
-        self.words = memoryview(bytearray(8 * ReaderState.COUNT)).cast("q")
+        self.words = state[: GOOD + SLOT_HEAD_SIZE].cast("q")
         self.newest = NOT_YET
         self.statistics = ReadStatistics()
 
@@ -260,18 +249,20 @@ class Reader:
     def read(self, tick: int) -> Reading[AnyMessage]:
         """Return the newest message visible at `tick`, with its verdict."""
         self.accesses += 1
-        serial = self._box[0]
-        last = self.serial
-        if serial != last:
-            self.slots.fence()
+        slots = self.slots
+        serial = slots.box[0]
+        if serial != self.serial:
+            slots.fence()
             # Older messages are overwritten: a serial beyond the slots fails when it is taken.
-            oldest = last if serial - last < self._depth else serial - self._depth
-            heads = self._heads
-            mask = self._mask
-            while serial > oldest and heads[serial & mask][Slot.VISIBLE_AT] > tick:
+            oldest = max(self.serial, serial - slots.depth)
+            while serial > oldest and slots.visible_at(serial) > tick:
                 serial -= 1
+        return self._take(serial, tick)
+
+    def _take(self, serial: int, tick: int) -> Reading[AnyMessage]:
+        """Take the message found by a read, if it is not the last good one."""
         self.found = serial
-        if serial == last:
+        if serial == self.serial:
             return self._unchanged
         return self._new if self._obtain(serial) else self._take_older(serial, tick)
 
@@ -290,18 +281,11 @@ class Reader:
         slots = self.slots
         if not slots.fetch(serial):
             return False
-        signature, basis, tick, visible = _HEAD(slots.record)
-        if signature != self._signature:
+        if slots.signature != self._signature:
             if not slots.is_lawful(self._signature):
                 return False
-            self._signature = signature
             self._unchanged = self._readings[Verdict.OLD]
         self.good[:] = slots.record
-        words = self.words
-        words[ReaderState.SERIAL] = serial
-        words[ReaderState.NEWEST] = tick
-        words[ReaderState.VISIBLE] = visible
-        words[ReaderState.BASIS] = basis
         return True
 
     def _step_back(self, serial: int, tick: int) -> Reading[AnyMessage]:
@@ -351,11 +335,9 @@ class Reader:
 
     def peek(self) -> Reading[AnyMessage]:
         """Return the newest whole message at once, under any protocol: for the host side."""
-        self.found = head = self._box[0]
+        head = self.slots.box[0]
         self.slots.fence()
-        if head == self.serial:
-            return self._unchanged
-        return self._new if self._obtain(head) else self._take_older(head, NOT_YET)
+        return self._take(head, NOT_YET)
 
 
 class DoubleBufferWriter(Writer):

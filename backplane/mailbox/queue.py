@@ -174,7 +174,7 @@ class QueueReader(Reader):
         super().__init__(segment, name)
         self._position = Writer(segment, taken_name(name))
         written = Reader(segment, taken_name(name)).peek().message.taken
-        taken, rest = divmod(self._box[Box.POSITION], 3)
+        taken, rest = divmod(self.slots.box[Box.POSITION], 3)
         self.taken = written if rest else max(written, taken)
         self._farthest = self.spec.delay + self.spec.every
         # The value of a reading without a new message, until there is one.
@@ -193,13 +193,14 @@ class QueueReader(Reader):
         `Writer.write`.
         """
         self.accesses += 1
-        box = self._box
+        slots = self.slots
+        box = slots.box
         count = 0
         earlier = list[AnyMessage]()
         head = box[Box.HEAD]
-        last = min(box[Box.SENT], self.taken + self._depth)
-        self.slots.fence()
-        if head > last and self.slots.fetch(head) and not self.slots.is_lawful(self._signature):
+        last = min(box[Box.SENT], self.taken + slots.depth)
+        slots.fence()
+        if head > last and slots.fetch(head) and not slots.is_lawful(self._signature):
             # Count a message that is not the writer's, and that its next one will replace: it is
             # not taken.
             self.statistics.bad_reads += 1
@@ -208,7 +209,6 @@ class QueueReader(Reader):
             before = copied(self.message) if count else None
             if not self._obtain(self.taken + 1):
                 # Count the fault of the message fetched last, which is not good.
-                slots = self.slots
                 statistics = self.statistics
                 statistics.bad_reads += 1
                 if slots.serial != self.taken + 1:
@@ -225,7 +225,7 @@ class QueueReader(Reader):
         newest = self.taken
         while self._sees(newest + 1, last, tick):
             newest += 1
-        self._box[Box.POSITION] = 3 * self.taken
+        box[Box.POSITION] = 3 * self.taken
         position = self._position
         _PUT_POSITION(position.message.raw, 0, self.taken, newest - self.taken)
         position.write(tick, now)
@@ -239,7 +239,7 @@ class QueueReader(Reader):
         """
         if serial > last:
             return False
-        ahead = self._heads[serial & self._mask][Slot.VISIBLE_AT] - tick
+        ahead = self.slots.visible_at(serial) - tick
         return ahead <= 0 or (ahead > self._farthest and not self.slots.fetch(serial))
 
     def close(self) -> None:

@@ -47,7 +47,6 @@ SIGNED_FROM = Slot.CHAIN * 8
 # Plain integers: an IntEnum member costs a conversion at every use as an index.
 _STAMP, _EPOCH, _CHAIN, _CHECK, _BASIS, _SERIAL, _TICK, _VISIBLE = range(8)
 _PUT_CONTENT = Struct("@4Q").pack_into  # BASIS to VISIBLE_AT, each stored whole
-_CLAIMANT = int(Box.CLAIMANT)
 UNSIGNED = (1 << 64) - 1
 """Mask that turns a word of a slot's head, which is signed, into a checksum."""
 EPOCH_BITS = 32
@@ -109,7 +108,9 @@ class Slots:
     tick = Word(Slot.TICK)
     visible = Word(Slot.VISIBLE_AT)
 
-    def __init__(self, segment: Segment, spec: MailboxSpec) -> None:
+    def __init__(
+        self, segment: Segment, spec: MailboxSpec, record: memoryview | None = None
+    ) -> None:
         self.spec = spec
         dtype = message_dtype(spec.fields, spec.size)
         address = segment.map.mailboxes[spec.name]
@@ -117,11 +118,10 @@ class Slots:
         self.box = segment.box(spec.name)
         self.depth = spec.depth
         self.mask = spec.depth - 1
-        self.record = memoryview(bytearray(SLOT_HEAD_SIZE + spec.size))
+        self.record = record or memoryview(bytearray(SLOT_HEAD_SIZE + spec.size))
         kind: Any = segment.message_classes.get(spec.name, AnyMessage)
         self.message: AnyMessage = kind(dtype, self.record[SLOT_HEAD_SIZE:])
         first = address + MAILBOX_HEAD_SIZE
-        self.ring = segment.view(first, spec.depth * stride)
         self.places = [
             segment.view(first + i * stride, len(self.record)) for i in range(spec.depth)
         ]
@@ -220,8 +220,7 @@ class Slots:
     def fetch(self, serial: int) -> bool:
         """Copy a message into the local record; False when it is not whole, or another one."""
         self.load(serial)
-        words = self.words
-        return words[_SERIAL] == serial and words[_CHECK] == xxh3(self.covered, words[_CHAIN])
+        return self.serial == serial and self.is_sound
 
     def between(self, before: int, newest: int) -> Iterator[AnyMessage]:
         """Yield a copy of each good message between two serials, as far as the slots reach back."""
@@ -246,7 +245,7 @@ class Slots:
         `known` is the signature of the last lawful message, 0 before the first: epochs only rise.
         """
         signature = self.signature
-        holder = self.box[_CLAIMANT]
+        holder = self.box[Box.CLAIMANT]
         return signature in (known, holder) or epoch_of(known) < epoch_of(signature) < epoch_of(
             holder
         )

@@ -91,7 +91,8 @@ def test_a_damaged_message_shows_in_the_trace_of_its_reader(bench: MakeBench) ->
     wave.cycle(0)
     slots = Slots(rack.segment, rack.segment.layout.mailbox("wave.status"))
     assert slots.fetch(1)
-    slots.ring[:] = bytes(b ^ 0x80 for b in slots.ring)
+    for place in slots.places:
+        place[:] = bytes(b ^ 0x80 for b in place)
     rack.to(8)
     watch.cycle(8)
     rack.to(15)
