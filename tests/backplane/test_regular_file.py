@@ -25,7 +25,7 @@ from rack.backplane.regular_file import (
         ("device", "not a regular file, but a character device"),
         ("folder", "not a regular file, but a directory"),
         ("socket", "not a regular file, but a socket"),
-        ("large", "too large, 9 bytes; permitted: 8"),
+        ("large", "too large: 9 bytes; the limit is 8"),
     ],
 )
 def test_only_a_regular_file_of_bounded_size_is_read(

@@ -144,7 +144,7 @@ def test_a_second_writer_is_refused_with_the_first_ones_process(make_bus: MakeBu
 
     def second(pid: int) -> bool:
         with pytest.raises(
-            MailboxError, match=f"'{NAME}' has a writer already, process {pid}; permitted: one"
+            MailboxError, match=f"'{NAME}' already has a writer \\(process {pid}\\)"
         ):
             open_writer(segment, NAME)
         return True
