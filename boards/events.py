@@ -1,4 +1,4 @@
-"""The record of a run: its events as they happen, and its end."""
+"""Events of a run as they happen, and the judgement of its end."""
 
 from __future__ import annotations
 
@@ -33,18 +33,25 @@ OfRun = Literal[
 OfFaults = Literal["fault", "detection", "miss", "reaction", "recovery", "held"]
 EventKind = OfRun | OfFaults
 CONTINUES = "continues"
-"""Code of the event that says before which tick a run begins that goes on from another."""
+"""Code of the event with the first tick of a run that continues another one."""
 
 
 @dataclass(frozen=True)
 class Event:
-    """An occurrence in a run. `time_ns` is CLOCK_REALTIME; `tick` is the system clock's (-1: before
-    the run).
+    """Occurrence in a run.
 
-    For programs: `code` is an alarm's name in lower case, "begins" or "ends" for a fault, or an
-    operator's command; `fault` is an entry of the fault table (-1: none); `subject` is the affected
-    mailbox, joint, task or level; `value` is the measured value, or a command's serial; `since` is
-    the tick at which the condition began (-1: unknown).
+    Attributes:
+        time_ns: CLOCK_REALTIME.
+        tick: Tick of the system clock, -1 before the run.
+        kind: Kind of event.
+        board: Board that the event concerns, empty for the whole rack.
+        text: Description for people.
+        code: Code for programs: an alarm's name in lower case, "begins" or "ends" for a fault,
+            or an operator's command.
+        fault: Index of an entry of the fault table, -1 for none.
+        subject: Affected mailbox, joint, task or level.
+        value: Measured value, or the serial of a command.
+        since: Tick at which the condition began, -1 if unknown.
     """
 
     time_ns: int
@@ -61,18 +68,22 @@ class Event:
 
 DEMANDED = "a stop is demanded"
 NO_TORQUE = "no torque"
-"""Reasons for which brakes engage: on a demand, of which other events say why, or because no torque
-came in time."""
+"""Reason for brakes that engaged because no torque came in time.
+
+Brakes that engage on a demand (`DEMANDED`) have their cause in other events.
+"""
 HELD_MS = 5e3
-"""Time on end for which an arm may be braked, or a level held, in a run that succeeds, without a
-cause in sight."""
+"""Time without interruption for which an arm may be braked, or a level held, in ms.
+
+A longer time without a known cause makes a run fail.
+"""
 HELD_PART = 0.5
-"""Part of a run for which an arm may be braked so, again and again."""
+"""Share of a run for which an arm may be braked in total without a known cause."""
 
 
 @dataclass(frozen=True)
 class Braking:
-    """Brakes that engaged for one reason at tick `since`."""
+    """Engagement of the brakes for one reason, from tick `since` on."""
 
     why: str
     since: int
@@ -80,8 +91,12 @@ class Braking:
 
 
 def brakings(events: Sequence[Event], end: int, tick_ms: float) -> tuple[Braking, ...]:
-    """Return every time that brakes engaged in a run of `end` ticks, by its events; not those of
-    the start.
+    """List every engagement of the brakes in a run, except at the start.
+
+    Args:
+        events: Events of the run.
+        end: Number of ticks of the run.
+        tick_ms: Length of a tick.
     """
     changes = [event for event in events if event.code in ("brakes_closed", "brakes_opened")]
     found = [
@@ -99,7 +114,11 @@ def brakings(events: Sequence[Event], end: int, tick_ms: float) -> tuple[Braking
 
 
 def braked_text(found: Sequence[Braking]) -> str:
-    """Return how often brakes engaged, at least once, how long, and why, as readable text."""
+    """Describe how often and how long brakes were engaged, and why.
+
+    Args:
+        found: At least one engagement.
+    """
     longest = max(found, key=lambda one: one.lasted_ms)
     total_ms = sum(one.lasted_ms for one in found)
     times = f"{total_ms:g} ms in all, longest {longest.lasted_ms:g} ms at tick {longest.since}"
@@ -118,22 +137,31 @@ Cause = Literal[
     "board lost",
     "launcher lost",
 ]
-"""A task is refused if it never began, as it has no moves; any other task that ends with an error
-has failed."""
+"""Reason why a run ended.
+
+A task is refused if it never began, which shows in a status without moves. Any other task that ends
+with an error has failed.
+"""
 SUCCESSES: tuple[Cause, ...] = ("task done", "time over")
 """Causes of a run that may have succeeded."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """The end of a run: its cause, its length in ticks, and the digest of everything written until
-    then.
+    """End of a run.
 
-    `state` and `reason` are those of the level that ends the run; `faults` are latched faults, lost
-    boards, objects beyond their goals when the task says that it is done, long holds without a
-    cause in sight, and levels that lost too many cycles. `brakings` are those after the start;
-    `objects`: where each ended; `excused`: a line for each level that lost too many cycles because
-    of injected faults.
+    Attributes:
+        cause: Reason for the end.
+        ticks: Length in ticks.
+        state: Last state of the level that ends the run.
+        reason: Reason in the last status of that level.
+        digest: Digest of everything written until the end.
+        faults: Reasons why the run failed: latched faults, lost boards, objects beyond their
+            goals although the task reports that it is done, long holds without a known cause,
+            and levels that lost too many cycles.
+        brakings: Engagements of the brakes after the start.
+        objects: Final positions of objects with goals.
+        excused: A line for each level that lost too many cycles because of injected faults.
     """
 
     cause: Cause
@@ -148,8 +176,9 @@ class Outcome:
 
     @property
     def failure(self) -> str:
-        """Why the run failed: a fault, or a task that was refused, failed or cut short; empty if it
-        succeeded.
+        """Reason why the run failed, empty if it succeeded.
+
+        A run fails by a fault, or because its task was refused, failed or cut short.
         """
         faults = "; ".join(self.faults)
         if self.cause in SUCCESSES:
@@ -158,21 +187,24 @@ class Outcome:
 
     @property
     def worked(self) -> bool:
-        """Whether the run succeeded."""
+        """True if the run succeeded."""
         return not self.failure
 
 
 def order_key(entry: Mapping[str, Any]) -> float:
-    """Return the place of an entry in an event log: its tick.
+    """Return the sort key of an entry in an event log, its tick.
 
-    Some events are known late: a board that drives an arm tells, once it is back, when the brakes
+    Some events are known late: a board that drives an arm reports after its return when the brakes
     engaged. Entries without a tick, such as the outcome, come last.
     """
     return float(entry.get("tick", math.inf))
 
 
 class Journal:
-    """Keeps `events`, and calls `on_event` with each. Without a `segment` there is no tick."""
+    """List of events that calls `on_event` with each new one.
+
+    `segment` supplies the ticks. Events have no tick while it is None.
+    """
 
     def __init__(self, on_event: Callable[[Event], None] | None) -> None:
         self.events: list[Event] = []
@@ -189,7 +221,17 @@ class Journal:
         tick: int | None = None,
         subject: str = "",
     ) -> None:
-        """Record an event that happens now, or happened at CLOCK_MONOTONIC `at_ns` and `tick`."""
+        """Record an event.
+
+        Args:
+            kind: Kind of event.
+            board: Board that the event concerns, empty for the whole rack.
+            text: Description for people.
+            code: Code for programs.
+            at_ns: Time of the event on CLOCK_MONOTONIC, by default now.
+            tick: Tick of the event, by default the current tick.
+            subject: Affected mailbox, joint, task or level.
+        """
         now_ns = time.time_ns()
         stamp_ns = now_ns if at_ns is None else now_ns - time.monotonic_ns() + at_ns
         if tick is None:
@@ -210,7 +252,7 @@ class Journal:
 
 
 def statuses(segment: Segment, field: str) -> Iterator[tuple[str, AnyMessage]]:
-    """Yield the last status of every level whose status has a field, with its board."""
+    """Yield board and last status of every level whose status has the given field."""
     for box in segment.layout.mailboxes:
         if box.name.endswith(".status") and field in (own.name for own in box.fields):
             status = open_observer(segment, box.name).peek()
@@ -219,7 +261,7 @@ def statuses(segment: Segment, field: str) -> Iterator[tuple[str, AnyMessage]]:
 
 
 def arm_states(segment: Segment) -> Iterator[tuple[str, AnyMessage]]:
-    """Yield the last state of every arm or hand, which it counts by itself, with its board."""
+    """Yield board and last state of every arm or hand."""
     for box in segment.layout.mailboxes:
         if box.message == "arm_state":
             yield box.writer, open_observer(segment, box.name).peek().message
@@ -248,8 +290,10 @@ class Ending:
         return state_name(status.state), reason
 
     def latched(self) -> list[str]:
-        """Return a line for every level whose last status reports an error, except the level that
-        ends the run; and for every arm that counts what its level does not report.
+        """Describe the latched faults of levels and arms, one line each.
+
+        A level has one if its last status reports an error, except for the level that ends the run.
+        An arm has one if it counted violations or contacts that its level does not report.
         """
         told = {
             board: f"level '{board}': {reason_of(status) or f'error {status.error}'}"
@@ -267,10 +311,16 @@ class Ending:
     def held(
         self, events: Sequence[Event], found: Sequence[Braking], ran_ms: float
     ) -> Iterator[str]:
-        """Yield in a line what held a run of `ran_ms` for so long that it is no success.
+        """Yield a line for each reason why a hold was too long for a successful run.
 
-        Nothing is yielded with a cause in sight: a fault was injected, an operator has commanded, a
-        stop is demanded. Levels of a rack on a network wait for other racks, and show for which.
+        Nothing is yielded if the cause is known: a fault was injected, an operator has commanded,
+        or a stop is demanded. Levels of a rack on a network are exempt, because they wait for other
+        racks and report for which.
+
+        Args:
+            events: Events of the run.
+            found: Engagements of the brakes.
+            ran_ms: Length of the run.
         """
         segment = self._segment
         if segment.words[System.DEMAND] or any(
@@ -306,8 +356,12 @@ class Ending:
             yield from held
 
     def ends(self, goals: Mapping[int, GoalConfig]) -> tuple[ObjectEnd, ...]:
-        """Return where objects that have goals ended, as sensed last; none if nothing senses
-        them.
+        """Return the final positions of objects that have goals, as sensed last.
+
+        The result is empty if no level senses them.
+
+        Args:
+            goals: Goals by the row of the object in the scene message.
         """
         for box in self._segment.layout.mailboxes:
             if (
@@ -326,14 +380,15 @@ class Ending:
         fields = self._segment.layout.mailbox(self._ends_run).fields
         if status.state != State.ERROR and not self._silence():
             return "task done" if status.state == State.DONE else "time over"
-        # The field `moves` of a status counts the moves of its program: none if it was refused.
+        # The field `moves` of a status counts the moves of its program. A refused one has none.
         counts_moves = any(field.name == "moves" and not field.shape for field in fields)
         is_refused = counts_moves and not status.moves
         return "task refused" if is_refused else "task failed"
 
     def _silence(self) -> int:
-        """Return the ticks since the last status of the level that ends the run; 0 if permitted, or
-        if it has ended.
+        """Return the ticks since the last status of the level that ends the run.
+
+        The result is 0 while the silence is permitted, or if the level has ended.
         """
         assert self._observer is not None, "some level ends the run"
         reading = self._observer.peek()
@@ -346,7 +401,7 @@ class Ending:
 
 @dataclass(frozen=True)
 class ObjectEnd:
-    """The goal of an object, and where it ended, m."""
+    """Goal and final position of an object, in m."""
 
     object: str
     goal: Sequence[float]
@@ -356,7 +411,7 @@ class ObjectEnd:
 
     @classmethod
     def of(cls, goal: GoalConfig, ended: Sequence[float]) -> Self:
-        """Return the end of the object that has a goal, m."""
+        """Compare the final position of an object with its goal, in m."""
         off_mm = round(1e3 * math.dist(ended, goal.position), 3)
         return cls(goal.object, goal.position, ended, off_mm, goal.tolerance_mm)
 

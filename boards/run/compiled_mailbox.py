@@ -1,9 +1,9 @@
-"""Mailboxes read and written by machine code: one call for all ports of a step of the cycle.
+"""Mailboxes accessed by compiled code, with one call for all ports of a step of the cycle.
 
-A call does what `WatchedReader.read` and `OutputPort.write` do in the usual case, on the same
-memory: the slots, the local records, and the words of a reader's state. What is rare (the first
-message of a writer, a damaged, lost or forged one, a silent writer) it leaves as it was, and says
-so: then the Python classes do it, which remain the reference.
+A call does the same as `WatchedReader.read` and `OutputPort.write` in the usual case, on the same
+memory: the slots, the local records, and the words of a reader's state. In rare cases (the first
+message of a writer, a damaged, lost or forged message, a silent writer) it changes nothing and
+reports the port. The Python classes, which remain the reference, handle it then.
 
 Loads and stores of heads are atomic, with acquire and release: see `rack.backplane.mailbox.slots`.
 Addresses stay valid in a fork and in a copy of a board, whose memory is at the same place.
@@ -36,24 +36,26 @@ PORT = _words(
     *("head", "slots", "record"),
     # Of the slots: distance in bytes, number, and bytes in use.
     *("stride", "depth", "size"),
-    # To read. Addresses of the reader's state and of the word that marks the writer as lost. Are
-    # messages visible by ticks? Are they taken and judged by compiled code, or by Python?
+    # To read: addresses of the reader's state and of the word that marks the writer as lost,
+    # whether messages are visible by ticks, and whether compiled code takes and judges them.
     *("state", "lost", "is_sliced", "is_watched"),
     *("late_from", "quiet"),  # ticks
-    # To write. Address and number of the addresses of the states of the readers on whose messages
-    # the written message depends.
+    # To write: address and length of an array with the addresses of the states of the readers on
+    # whose messages the written message depends.
     *("sources", "source_count"),
-    *("every", "ahead", "delay"),  # ticks: period, 0 to read; phase; until a message is visible
-    "result",  # of the last read; or the process of an intruder found by the last write, 0 for none
+    # Period, 0 for a mailbox to read; phase; time until a message is visible. In ticks.
+    *("every", "ahead", "delay"),
+    # Result of the last read, or the process of an intruder found by the last write.
+    "result",
 )
-"""A mailbox to read or to write."""
+"""Record of a mailbox to read or to write."""
 _SIGNATURE = 8 * Slot.EPOCH
 _VISIBLE = 8 * Slot.VISIBLE_AT
 _PORT_SIZE = PORT.itemsize
 OLD, NEW, ODD, SILENT, SLOW = 0, 1, 2, 4, 8
 """Results of a read. ODD and SILENT: Python judges messages or silence. SLOW: Python reads."""
 MOST_PORTS = 60
-"""Maximum number of ports of a table: each has a bit in the result of a call."""
+"""Maximum number of ports of a table, since each has a bit in the result of a call."""
 
 
 port_at = record_at(PORT)
@@ -70,7 +72,10 @@ def slot_of(port: Any, serial: int) -> int:
 
 @compiled
 def take(port: Any, serial: int) -> bool:
-    """Take a good message of the writer of the last one; leave any other: see `Reader._obtain`."""
+    """Accept a good message of the same writer as before, as `Reader._obtain` does.
+
+    Any other message is left to Python.
+    """
     slot = slot_of(port, serial)
     copy(port.record, slot, SIGNED_FROM)
     fence()
@@ -89,7 +94,7 @@ def take(port: Any, serial: int) -> bool:
 
 @compiled
 def read_port(port: Any, tick: int) -> int:
-    """Read one mailbox as `WatchedReader.read` does; return the result."""
+    """Read one mailbox as `WatchedReader.read` does, and return the result."""
     state = state_at(port.state)
     serial = load(port.head)
     oldest = max(state.serial, serial - port.depth)
@@ -103,7 +108,7 @@ def read_port(port: Any, tick: int) -> int:
     state.accesses += 1
     state.found = serial
     if port.is_watched:
-        # Usually nothing is new, or the next message is there, released later, in time.
+        # Usually nothing is new, or the next message has come in time with a later release.
         if 0 <= state.judged == serial - 1 and (
             state.judged_tick < state.tick > state.visible - port.late_from
         ):
@@ -118,7 +123,7 @@ def read_port(port: Any, tick: int) -> int:
 
 @compiled
 def publish(port: Any, tick: int, stamp: int) -> int:
-    """Publish the message of a port's record as `Slots.publish` does; return the intruder."""
+    """Publish the message of a port's record as `Slots.publish` does, and return the intruder."""
     record = slot_at(port.record)
     before = record.serial
     slot = slot_of(port, before + 1)
@@ -137,7 +142,7 @@ def publish(port: Any, tick: int, stamp: int) -> int:
     record.visible = tick + port.delay
     record.chain = record.check
     record.check = xxh3(port.record + CHECKED_FROM, port.size - CHECKED_FROM, record.chain)
-    # In this order: the previous head, the message, its signature, this head.
+    # The order of stores is: the previous head, the message, its signature, this head.
     fence()
     copy(slot + SIGNED_FROM, port.record + SIGNED_FROM, port.size - SIGNED_FROM)
     fence()
@@ -154,10 +159,10 @@ def access_ports(table: int, count: int, tick: int, stamp: int) -> int:
         table: Address of the ports, of type `PORT`.
         count: Number of ports.
         tick: Release tick of the cycle, whose end has not come.
-        stamp: CLOCK_MONOTONIC, ns, for messages that are written.
+        stamp: Time stamp of written messages, in ns of CLOCK_MONOTONIC.
 
     Returns:
-        A bit for each port that Python must look at, because its result is new or unusual.
+        A bit for each port that Python must handle, because its result is new or unusual.
     """
     touched = 0
     for at in range(count):
@@ -175,12 +180,12 @@ def access_ports(table: int, count: int, tick: int, stamp: int) -> int:
 
 @compiled
 def order() -> None:
-    """Do what `Slots.fence` promises, on any processor."""
+    """Implement `Slots.fence` on any processor."""
     fence()
 
 
 def load_machine_code() -> None:
-    """Load all of it, compiled or from the cache: once, before a crate forks its boards."""
+    """Load the compiled functions of mailboxes, before a crate forks its boards."""
     access_ports.preload()
     Slots.fence = staticmethod(order.load())  # type: ignore[method-assign]  # the reference needs none on x86-64
     Slots.fence()

@@ -1,9 +1,9 @@
-"""Instructions that Python does not have, for compiled code: atomic loads and stores, fences, and
-copies between addresses.
+"""Instructions that Python does not have, for compiled code.
 
-LLVM translates them for the processor at hand. On x86-64 they become ordinary loads and stores,
-which that processor does not reorder; on others LLVM adds barriers. Addresses must be aligned to 8
-bytes. The functions work in compiled code only.
+These are atomic loads and stores, fences, and copies between addresses. LLVM translates them for
+the processor at hand. On x86-64 they become ordinary loads and stores, which that processor does
+not reorder. On others LLVM adds barriers. Addresses must be aligned to 8 bytes. The functions work
+only in compiled code.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from rack.levels.compiled import c_function, compiled
 class instruction(compiled[..., Any]):  # noqa: N801  # a decorator
     """Mark a function that emits LLVM instructions, for use in compiled code.
 
-    It is called with LLVM's builder and the arguments, which are words, and returns the result: a
-    word, or a record of the type `record`. None stands for 0.
+    The function is called with LLVM's builder and the arguments, which are words. It returns a
+    word, the address of a record of type `record`, or None for 0.
     """
 
     def __init__(self, emit: Callable[..., Any], record: np.dtype | None = None) -> None:
@@ -31,7 +31,7 @@ class instruction(compiled[..., Any]):  # noqa: N801  # a decorator
         self._record = record
 
     def source(self) -> Iterator[bytes]:
-        """Yield this file and the type of the record, on which a caller's code depends."""
+        """Yield this file and the type of the record, on which the code of a caller depends."""
         yield Path(__file__).read_bytes()
         yield repr(self._record).encode()
 
@@ -93,4 +93,7 @@ def record_at(dtype: np.dtype) -> instruction:
 
 
 xxh3 = c_function(_xxhash.__file__, "XXH3_64bits_withSeed", 3)
-"""Return the checksum of memory: address, size in bytes, seed. Python's `xxhash` calls it too."""
+"""C function that computes a checksum from address, size in bytes and seed.
+
+Python's `xxhash` calls the same function.
+"""

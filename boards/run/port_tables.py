@@ -1,7 +1,7 @@
-"""The mailboxes of one step of the cycle as a table for machine code: reads of plan, or of commands
-and statuses; writes.
+"""The mailboxes of one step of the cycle as a table for compiled code.
 
-Python looks at the ports alone whose reading has changed, and reads and writes those of other
+A step is the reading of the plan, the reading of commands and statuses, or the writing. Python
+handles only the ports whose result has changed, and reads and writes the mailboxes of other
 protocols itself.
 """
 
@@ -37,8 +37,13 @@ WORD = 8
 
 
 class Line(NamedTuple):
-    """One mailbox to read: where its reading goes, the function that reads it as of a tick, and the
-    reader behind that.
+    """One mailbox to read.
+
+    Attributes:
+        values: Table that receives the reading.
+        key: Key of the reading in that table.
+        read: Reads the mailbox as of a tick.
+        watched: The watched reader behind `read`.
     """
 
     values: dict[str, Reading[AnyMessage]]
@@ -48,7 +53,7 @@ class Line(NamedTuple):
 
 
 class PortTable:
-    """Records of mailboxes, and the compiled function that accesses them all in one call."""
+    """Records of mailboxes, and the compiled function that accesses all of them in one call."""
 
     def __init__(self, slots: Sequence[Slots]) -> None:
         self._ports = np.zeros(len(slots), PORT)
@@ -65,7 +70,7 @@ class PortTable:
 
 
 class ReadTable(PortTable):
-    """The reads of one step. Compiled code makes those that it can, Python the others."""
+    """The reads of one step. Compiled code does the reads that it supports, Python the others."""
 
     def __init__(self, lines: Sequence[Line]) -> None:
         self._lines = [line for line in lines if can_read(line)][:MOST_PORTS]
@@ -95,7 +100,7 @@ class ReadTable(PortTable):
 
 
 def can_read(line: Line) -> bool:
-    """Whether machine code can read a mailbox: at every tick, without a lock."""
+    """Check whether compiled code can read a mailbox: at every tick, without a lock."""
     watched = line.watched
     return line.read == watched.read and type(watched.reader) in (Reader, DoubleBufferReader)
 
@@ -112,7 +117,11 @@ def _conclude(line: Line, result: int, tick: int) -> Reading[AnyMessage]:
 
 
 def address_of(memory: memoryview) -> int:
-    """Return the address of memory. Raises `MailboxError` when it is not aligned to words."""
+    """Return the address of memory.
+
+    Raises:
+        MailboxError: The memory is not aligned to words.
+    """
     address = int(np.frombuffer(memory, np.uint8).ctypes.data)
     if address % WORD:
         raise MailboxError(
@@ -149,7 +158,7 @@ class WriteTable(PortTable):
         """Write the messages that are due, in a cycle whose end has not come.
 
         Returns:
-            True if another process has published in the place of a writer.
+            True if a writer must be checked for an intruder, which its `intruder` names.
         """
         touched = self._access(tick, monotonic_ns())
         if touched:
@@ -159,6 +168,6 @@ class WriteTable(PortTable):
 
 
 def can_write(writer: Writer) -> bool:
-    """Whether machine code can write a mailbox: once in each of its cycles, without a lock."""
+    """Check whether compiled code can write a mailbox: in every due cycle, without a lock."""
     spec = writer.spec
     return spec.protocol not in ("queue", "lock") and not spec.max_age
