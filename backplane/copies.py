@@ -64,10 +64,10 @@ def fill_memory(segment: Segment, fd: int, tick: int) -> None:
         tick: First tick that the new rack runs.
     """
     words = segment.words
-    own = [(at, words[at]) for at in OF_LAUNCH]
+    launch_words = [(at, words[at]) for at in OF_LAUNCH]
     start = 8 * System.STATE
     os.preadv(fd, [segment.bytes[start : segment.map.size]], start)
-    for at, value in own:
+    for at, value in launch_words:
         words[at] = value
     words[System.FOLLOWER_TICK] = words[System.FOLLOWER_DRAINED] = tick - 1
     for task in segment.layout.processes:

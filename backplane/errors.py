@@ -29,8 +29,8 @@ class RackInUseError(SegmentError):
 class DamageError(SegmentError):
     """Raised if shared memory has a content that no process of the rack writes."""
 
-    def __init__(self, what: str) -> None:
-        super().__init__(f"the rack's shared memory is damaged: {what}")
+    def __init__(self, detail: str) -> None:
+        super().__init__(f"the rack's shared memory is damaged: {detail}")
 
 
 class MailboxError(BackplaneError):

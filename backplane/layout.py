@@ -309,8 +309,10 @@ class Layout:
 
         They are ordered by the slot of their sender.
         """
-        found = [m for m in self.mailboxes if m.interrupt is not None and slot in m.interrupt.slots]
-        return sorted(found, key=lambda mailbox: self.task(mailbox.writer).slot)
+        mailboxes = [
+            m for m in self.mailboxes if m.interrupt is not None and slot in m.interrupt.slots
+        ]
+        return sorted(mailboxes, key=lambda mailbox: self.task(mailbox.writer).slot)
 
     def handler(self, slot: int) -> str:
         """Return the task that serves the interrupts of the board in a slot, its first task.
@@ -347,5 +349,5 @@ def depth_for(span_ticks: int, every: int) -> int:
     Returns:
         A power of two, at least 4.
     """
-    wanted = max(4, -(-span_ticks // every) + 3)
-    return 1 << (wanted - 1).bit_length()
+    slot_count = max(4, -(-span_ticks // every) + 3)
+    return 1 << (slot_count - 1).bit_length()

@@ -46,9 +46,9 @@ class UtilityLines:
     @property
     def bad_inputs(self) -> list[str]:
         """Reasons why the latch must not be reset: asserted utility lines and lost boards."""
-        found = [f"SYSFAIL of slot {slot}" for slot in self.sysfail]
-        found += ["ACFAIL"] if self.acfail else []
-        return found + [
+        reasons = [f"SYSFAIL of slot {slot}" for slot in self.sysfail]
+        reasons += ["ACFAIL"] if self.acfail else []
+        return reasons + [
             f"board '{name}' is lost" for name, block in self._blocks.items() if block[Block.LOST]
         ]
 

@@ -80,12 +80,12 @@ def touch_memory() -> None:
     _libc.mallopt(_M_MMAP_MAX, 0)
     reserve = ctypes.create_string_buffer(RESERVE)
     del reserve
-    for span, rights, used in _mappings():
+    for span, rights, stretches in _mappings():
         if rights == "rw-s":
-            used = [span]  # the segment: all of it
+            stretches = [span]  # the segment: all of it
         elif rights[1] != "w":
             continue
-        for first, last in used:
+        for first, last in stretches:
             _libc.madvise(first, last - first, _POPULATE_WRITE)
     for first, last in _FILES:
         _libc.madvise(first, last - first, _POPULATE_READ)
@@ -105,11 +105,11 @@ def _used(pagemap: int, start: int, end: int) -> Iterator[tuple[int, int]]:
     """Yield the resident stretches of a mapping as pairs of addresses."""
     page = mmap.PAGESIZE
     entries = np.frombuffer(os.pread(pagemap, (end - start) // page * 8, start // page * 8), "u8")
-    used = np.flatnonzero(entries >> _PRESENT)
-    if not len(used):
+    pages = np.flatnonzero(entries >> _PRESENT)
+    if not len(pages):
         return
-    breaks = np.flatnonzero(np.diff(used) > GAP)
-    firsts = used[np.append(0, breaks + 1)]
-    lasts = used[np.append(breaks, len(used) - 1)] + 1
+    breaks = np.flatnonzero(np.diff(pages) > GAP)
+    firsts = pages[np.append(0, breaks + 1)]
+    lasts = pages[np.append(breaks, len(pages) - 1)] + 1
     for first, last in zip(firsts.tolist(), lasts.tolist(), strict=True):
         yield start + first * page, start + last * page

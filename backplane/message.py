@@ -119,8 +119,8 @@ def make_message(name: str, version: int, base: type[B], fields: Mapping[str, An
         fields: Results of `field` by name, for integers and groups.
     """
     body = {**fields, "__annotations__": dict.fromkeys(fields, int), "__module__": __name__}
-    made: Any = type(name, (base,), body, version=version, message=name)
-    return made  # type: ignore[no-any-return]
+    message_class: Any = type(name, (base,), body, version=version, message=name)
+    return message_class  # type: ignore[no-any-return]
 
 
 class Message:
@@ -154,9 +154,9 @@ class Message:
             MailboxError: A message cannot have such a field.
         """
         fields = {f.name: f for base in cls.__bases__ for f in base.message_type.fields}  # type: ignore[attr-defined]
-        own = {name: d for name, d in vars(cls).items() if isinstance(d, Field)}
-        hints = get_type_hints(cls) if own else {}
-        for name, declared in own.items():
+        declared_fields = {name: d for name, d in vars(cls).items() if isinstance(d, Field)}
+        hints = get_type_hints(cls) if declared_fields else {}
+        for name, declared in declared_fields.items():
             try:
                 is_taken = hasattr(Message, name) or name in Message.__annotations__
                 if name.startswith("_") or is_taken or name not in hints:
@@ -172,8 +172,8 @@ class Message:
         cls.message_type = MessageType(known_as, version, tuple(fields.values()))
 
     def __new__(cls, dtype: np.dtype, buffer: memoryview | None = None) -> Self:  # noqa: D102  # as the class
-        made: Self = object.__new__(_resolved(cls, dtype))  # type: ignore[arg-type]
-        return made
+        message: Self = object.__new__(_resolved(cls, dtype))  # type: ignore[arg-type]
+        return message
 
     def __init__(self, dtype: np.dtype, buffer: memoryview | None = None) -> None:
         raw = memoryview(bytearray(dtype.itemsize)) if buffer is None else buffer
@@ -218,8 +218,8 @@ class Message:
     def _unknown(self, name: str) -> str:
         names = self.record.dtype.names or ()
         near = get_close_matches(name, names, 1)
-        what = f"did you mean '{near[0]}'?" if near else f"fields: {', '.join(names)}"
-        return f"message '{self.message_type.name}' has no field '{name}'; {what}"
+        hint = f"did you mean '{near[0]}'?" if near else f"fields: {', '.join(names)}"
+        return f"message '{self.message_type.name}' has no field '{name}'; {hint}"
 
     def __repr__(self) -> str:
         return f"Message({ {n: self.record[n].tolist() for n in self.record.dtype.names or ()} })"
@@ -305,8 +305,8 @@ def _resolved(cls: type[B], dtype: np.dtype) -> type[B]:
     }
     kind = cls.message_type
     options = {"version": kind.version, "message": kind.name}
-    made: Any = type(cls.__name__, (cls,), body, **options)
-    return made  # type: ignore[no-any-return]
+    resolved_class: Any = type(cls.__name__, (cls,), body, **options)
+    return resolved_class  # type: ignore[no-any-return]
 
 
 def _scalar(name: str, dtype: np.dtype, declared: Field | None) -> property:

@@ -170,8 +170,8 @@ class OperatorTable:
 
     def waiting(self) -> list[RequestEntry]:
         """Return the waiting requests in the order in which they were added."""
-        found = [entry for entry in self.entries if self.is_waiting(entry)]
-        return sorted(found, key=lambda entry: entry.ticket)
+        entries = [entry for entry in self.entries if self.is_waiting(entry)]
+        return sorted(entries, key=lambda entry: entry.ticket)
 
     def lacking(self, requests: Sequence[Request]) -> list[Request]:
         """Return the commands of a run that are not waiting in the table.
@@ -181,14 +181,14 @@ class OperatorTable:
                 was issued. A command that was added late was issued after its requested tick.
         """
         waiting = sorted(self.waiting(), key=lambda entry: entry.tick)
-        found = []
-        for wanted in requests:
-            entry = next((entry for entry in waiting if entry.becomes(wanted)), None)
+        missing = []
+        for request in requests:
+            entry = next((entry for entry in waiting if entry.becomes(request)), None)
             if entry is None:
-                found.append(wanted)
+                missing.append(request)
             else:
                 waiting.remove(entry)
-        return found
+        return missing
 
     def _fill(self, request: Request, client: Client) -> RequestEntry:
         """Fill an entry. The caller holds the lock of the table.

@@ -69,8 +69,8 @@ def is_alive(pid: int, started: int = 0) -> bool:
         started: Start time of the expected process, because pids are reused. 0 accepts any
             process.
     """
-    found = start_time(pid) if pid > 0 else 0
-    return bool(found) and started in (0, found)
+    start = start_time(pid) if pid > 0 else 0
+    return bool(start) and started in (0, start)
 
 
 def readable(fd: int, timeout_s: float) -> bool:
@@ -165,9 +165,9 @@ def _reserve(reservation: Reservation) -> bool:
     runtime_ns, period_ns = reservation
     times = runtime_ns, period_ns, period_ns
     record = Struct("=IIQiIQQQ")
-    wanted = record.pack(record.size, SCHED_DEADLINE, _RESET_ON_FORK | _RECLAIM, 0, 0, *times)
+    attributes = record.pack(record.size, SCHED_DEADLINE, _RESET_ON_FORK | _RECLAIM, 0, 0, *times)
     number = _SCHED_SETATTR.get(platform.machine())
-    return number is not None and _libc.syscall(number, 0, wanted, 0) == 0
+    return number is not None and _libc.syscall(number, 0, attributes, 0) == 0
 
 
 def wake_up_exactly() -> None:
@@ -204,10 +204,10 @@ def mapped_and_locked(pid: int) -> tuple[int, int]:
 
     Both are 0 if the process does not exist.
     """
-    found: list[str] = []
+    sizes_kib: list[str] = []
     with suppress(FileNotFoundError, ProcessLookupError):
-        found = re.findall(r"Vm(?:Size|Lck):\s*(\d+)", Path(f"/proc/{pid}/status").read_text())
-    mapped, locked = (int(kib) << 10 for kib in found or "00")
+        sizes_kib = re.findall(r"Vm(?:Size|Lck):\s*(\d+)", Path(f"/proc/{pid}/status").read_text())
+    mapped, locked = (int(kib) << 10 for kib in sizes_kib or "00")
     return mapped, locked
 
 
@@ -219,10 +219,9 @@ def refusal(error: OSError) -> str:
     }
     if error.errno not in limits:
         return str(error)
-    what, option, limit = limits[error.errno]
-    return (
-        f"{error.strerror}: at most {getrlimit(limit)[0]} {what} are permitted (ulimit -{option})"
-    )
+    resource, option, limit = limits[error.errno]
+    most = getrlimit(limit)[0]
+    return f"{error.strerror}: the limit is {most} {resource} (ulimit -{option})"
 
 
 def set_priority(priority: int) -> bool:

@@ -179,14 +179,18 @@ class Segment:
                     " 'rack clean'"
                 )
                 raise SegmentError(f"rack '{layout.rack}' {why}") from None
-            found = os.statvfs(SHM_FOLDER)
-            whole, free = (count * found.f_frsize for count in (found.f_blocks, found.f_bavail))
-            room = (
+            file_system = os.statvfs(SHM_FOLDER)
+            whole, free = (
+                count * file_system.f_frsize
+                for count in (file_system.f_blocks, file_system.f_bavail)
+            )
+            space_text = (
                 f"{SHM_FOLDER} has {whole} bytes, {free} of them free; in a container --shm-size"
                 " enlarges it"
             )
             raise SegmentError(
-                f"rack '{layout.rack}': {size} bytes of shared memory: {error.strerror}: {room}"
+                f"rack '{layout.rack}': {size} bytes of shared memory: {error.strerror}:"
+                f" {space_text}"
             ) from None
         return segment
 
@@ -258,12 +262,12 @@ class Segment:
             raise SegmentError(
                 f"rack '{rack}' {why}; racks: {', '.join(racks()) or 'none'}"
             ) from None
-        found = os.fstat(shm.fd)
-        if os.getuid() not in (found.st_uid, 0) or found.st_size < HEAD_SIZE:
+        status = os.fstat(shm.fd)
+        if os.getuid() not in (status.st_uid, 0) or status.st_size < HEAD_SIZE:
             os.close(shm.fd)
-            why = f"owner {found.st_uid}, {found.st_size} bytes: not a segment of this user"
+            why = f"owner {status.st_uid}, {status.st_size} bytes: not a segment of this user"
             raise SegmentError(f"rack '{rack}': {why}")
-        return cls(rack, mmap.mmap(shm.fd, found.st_size), shm.fd)
+        return cls(rack, mmap.mmap(shm.fd, status.st_size), shm.fd)
 
     def read_head(self) -> None:
         """Read the texts of the segment.

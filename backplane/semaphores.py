@@ -68,9 +68,9 @@ class Semaphore:
     @property
     def value(self) -> int:
         """Number of waits that the semaphore would satisfy now."""
-        found = ctypes.c_int()
-        _sem_getvalue(ctypes.addressof(self._place), ctypes.addressof(found))
-        return found.value
+        count = ctypes.c_int()
+        _sem_getvalue(ctypes.addressof(self._place), ctypes.addressof(count))
+        return count.value
 
     def bind(self, deadline_ns: int) -> None:
         """Set the time at which waits end, in ns of CLOCK_MONOTONIC."""

@@ -121,11 +121,11 @@ class CycleRecord:
         count = self._block[Block.TRACE_HEAD]
         for number in range(count, max(0, count - self._depth), -1):
             at = self._at(number)
-            found = self._words[at + _TICK]
+            record_tick = self._words[at + _TICK]
             ended_ns = self._words[at + _END]
-            if not self._keeps(number) or found < tick:
+            if not self._keeps(number) or record_tick < tick:
                 return None
-            if found == tick:
+            if record_tick == tick:
                 return ended_ns
         return None
 

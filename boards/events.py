@@ -99,16 +99,16 @@ def brakings(events: Sequence[Event], end: int, tick_ms: float) -> tuple[Braking
         tick_ms: Length of a tick.
     """
     changes = [event for event in events if event.code in ("brakes_closed", "brakes_opened")]
-    found = [
-        (one.subject, one.tick - int(one.value), one.tick)
-        for one in changes
-        if one.code == "brakes_opened"
+    engagements = [
+        (change.subject, change.tick - int(change.value), change.tick)
+        for change in changes
+        if change.code == "brakes_opened"
     ]
     if changes and changes[-1].code == "brakes_closed":
-        found.append((changes[-1].subject, changes[-1].tick, end))
+        engagements.append((changes[-1].subject, changes[-1].tick, end))
     return tuple(
         Braking(why, since, round((until - since) * tick_ms, 6))
-        for why, since, until in found
+        for why, since, until in engagements
         if why
     )
 
@@ -119,11 +119,11 @@ def braked_text(found: Sequence[Braking]) -> str:
     Args:
         found: At least one engagement.
     """
-    longest = max(found, key=lambda one: one.lasted_ms)
-    total_ms = sum(one.lasted_ms for one in found)
+    longest = max(found, key=lambda braking: braking.lasted_ms)
+    total_ms = sum(braking.lasted_ms for braking in found)
     times = f"{total_ms:g} ms in all, longest {longest.lasted_ms:g} ms at tick {longest.since}"
     reasons = ", ".join(
-        f"{why} ({count})" for why, count in Counter(one.why for one in found).most_common()
+        f"{why} ({count})" for why, count in Counter(braking.why for braking in found).most_common()
     )
     return f"brakes engaged {len(found)} time{'s' * (len(found) > 1)}, {times}: {reasons}"
 
@@ -254,7 +254,7 @@ class Journal:
 def statuses(segment: Segment, field: str) -> Iterator[tuple[str, AnyMessage]]:
     """Yield board and last status of every level whose status has the given field."""
     for box in segment.layout.mailboxes:
-        if box.name.endswith(".status") and field in (own.name for own in box.fields):
+        if box.name.endswith(".status") and field in (declared.name for declared in box.fields):
             status = open_observer(segment, box.name).peek()
             if status.is_there:
                 yield box.writer, status.message
@@ -295,7 +295,7 @@ class Ending:
         A level has one if its last status reports an error, except for the level that ends the run.
         An arm has one if it counted violations or contacts that its level does not report.
         """
-        told = {
+        reported = {
             board: f"level '{board}': {reason_of(status) or f'error {status.error}'}"
             for board, status in statuses(self._segment, "error")
             if status.error and f"{board}.status" != self._ends_run
@@ -306,7 +306,7 @@ class Ending:
             for board, state in arm_states(self._segment)
             if state.violations or state.touches
         }
-        return [*(counted | told).values()]
+        return [*(counted | reported).values()]
 
     def held(
         self, events: Sequence[Event], found: Sequence[Braking], ran_ms: float
@@ -334,11 +334,11 @@ class Ending:
             for name, message in (*arm_states(segment), *statuses(segment, "braked"))
             if message.braked and name not in hands and not found
         }
-        never = []
+        unreleased = []
         for name, message in braked.items():
             since = segment.block(name)[Block.LEVEL_SINCE]
             why = reason_of(message) or NO_TORQUE
-            never.append(Braking(why, since, ran_ms - since * tick_ms))
+            unreleased.append(Braking(why, since, ran_ms - since * tick_ms))
         held = []
         for name, status in statuses(segment, "state"):
             block = segment.block(name)
@@ -348,8 +348,8 @@ class Ending:
                     f"level '{name}' held for {lasted_ms:g} ms without a cause in sight:"
                     f" {reason_of(status) or 'no reason given'}"
                 )
-        counted = [one for one in found if one.why != DEMANDED] or never
-        times = [one.lasted_ms for one in counted]
+        counted = [braking for braking in found if braking.why != DEMANDED] or unreleased
+        times = [braking.lasted_ms for braking in counted]
         if max(times, default=0.0) > HELD_MS or sum(times) > HELD_PART * ran_ms:
             yield f"held without a cause in sight, in {ran_ms:g} ms: {braked_text(counted)}"
         elif not any(box.name.startswith("lan.") for box in segment.layout.mailboxes):

@@ -59,10 +59,10 @@ def ages_of(exchange: Message) -> dict[str, PortAge]:
     names = exchange.record.dtype.names or ()
     values = iter(exchange.raw.cast("q"))
     labels = [name.removesuffix(f"_{AGE}") for name in names[::2]]
-    found = {
+    ports = {
         label: PortAge(age, taken) for label, age, taken in zip(labels, values, values, strict=True)
     }
-    return {label: port for label, port in found.items() if port.taken != NEVER}
+    return {label: port for label, port in ports.items() if port.taken != NEVER}
 
 
 class Taken(NamedTuple):

@@ -31,10 +31,10 @@ def _mailbox(entry: RequestEntry, layout: Layout) -> MailboxSpec:
     Raises:
         DamageError: The mailbox is not an operator's.
     """
-    found = pick(layout.mailboxes, entry.mailbox, "mailbox")
-    if found.message != OperatorCommand.message_type.name:
-        raise DamageError(f"a command for '{found.name}'")
-    return found
+    mailbox = pick(layout.mailboxes, entry.mailbox, "mailbox")
+    if mailbox.message != OperatorCommand.message_type.name:
+        raise DamageError(f"a command for '{mailbox.name}'")
+    return mailbox
 
 
 def hold(mailbox: MailboxSpec) -> OperatorCommand:
@@ -46,22 +46,22 @@ def hold(mailbox: MailboxSpec) -> OperatorCommand:
 
 def describe(message: OperatorCommand) -> str:
     """Describe a command in one line: its verb, the name in it, and its goal."""
-    what = as_named(Operation, message.what).name.lower()
+    verb = as_named(Operation, message.what).name.lower()
     goal = message.goal
     if goal == Goal.JOINTS:
-        return f"{what} joints {_numbers(message.joints[: message.count])}"
+        return f"{verb} joints {_numbers(message.joints[: message.count])}"
     if goal == Goal.POSE:
         return (
-            f"{what} position {_numbers(message.position)} quaternion"
+            f"{verb} position {_numbers(message.position)} quaternion"
             f" {_numbers(message.quaternion)}"
         )
     if goal == Goal.DIRECTION:
         return (
-            f"{what} position {_numbers(message.position)} direction {_numbers(message.direction)}"
+            f"{verb} position {_numbers(message.position)} direction {_numbers(message.direction)}"
         )
     name = f" {message.name}" if message.name else ""
     kind = f" {as_named(Goal, goal).name.lower()}" if goal else ""
-    return f"{what}{name}{kind}"
+    return f"{verb}{name}{kind}"
 
 
 def _numbers(values: np.ndarray) -> str:

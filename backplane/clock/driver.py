@@ -111,12 +111,12 @@ class ClockDriver(ABC):
 
     def due(self, tick: int, last: int) -> list[ReleasedTask]:
         """Return the tasks with a release in (last, tick], in the order of their releases."""
-        found: list[ReleasedTask] = []
+        due_tasks: list[ReleasedTask] = []
         for every, phase, tasks in self._groups:
             release = tick - (tick - phase) % every
             if release > last:
-                found += [task for task in tasks if task.is_free(release)]
-        return found
+                due_tasks += [task for task in tasks if task.is_free(release)]
+        return due_tasks
 
     def check(self, released: list[ReleasedTask], tick: int) -> None:
         """Do the work that is due after the release of these tasks."""
@@ -174,9 +174,9 @@ class ClockDriver(ABC):
             return True
         # Ask even if the stop is known, because a run that continues this one may end by the
         # answer.
-        found = self._ended(tick)
-        if not stop and found is not None:
-            stop = words[System.STOP_TICK] = max(found, self.first_end, 1)
+        end_tick = self._ended(tick)
+        if not stop and end_tick is not None:
+            stop = words[System.STOP_TICK] = max(end_tick, self.first_end, 1)
         return bool(stop) and tick >= stop
 
     @property

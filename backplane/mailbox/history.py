@@ -64,8 +64,8 @@ class MailboxRing(Ring):
             self._taken -= 1
         covered = rows.view(np.uint8).reshape(len(rows), self._stride)[:, self._covered]
         checks = (
-            xxh3(part.tobytes(), chain)
-            for part, chain in zip(covered, rows["chain"].tolist(), strict=True)
+            xxh3(content.tobytes(), chain)
+            for content, chain in zip(covered, rows["chain"].tolist(), strict=True)
         )
         good = (
             lawful
@@ -97,7 +97,7 @@ def chains(segment: Segment, until: int) -> dict[str, tuple[int, int]]:
         segment: Memory of the rack.
         until: Only messages that were visible before this tick count.
     """
-    found = {}
+    chain_by_mailbox = {}
     for spec in segment.layout.timed:
         slots = Slots(segment, spec)
         serial = head = slots.box[Box.HEAD]
@@ -108,8 +108,8 @@ def chains(segment: Segment, until: int) -> dict[str, tuple[int, int]]:
         ):
             serial -= 1
         chain = slots.chain if serial > oldest else 0
-        found[spec.name] = (serial, chain)
-    return found
+        chain_by_mailbox[spec.name] = (serial, chain)
+    return chain_by_mailbox
 
 
 def digest(segment: Segment, until: int | None = None) -> str:

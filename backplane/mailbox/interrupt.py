@@ -165,7 +165,7 @@ class BoardInbox:
         self._tick = -1
         self._newest_ns = 0
         # Messages that have arrived and are not yet served: end of the service, line and serial.
-        self._ahead: deque[tuple[int, InterruptLine, int]] = deque()
+        self._in_service: deque[tuple[int, InterruptLine, int]] = deque()
 
     def advance(self, tick: int) -> None:
         """Process all arrivals and services up to the release at `tick`."""
@@ -180,9 +180,9 @@ class BoardInbox:
             arrivals.sort()
         for at_ns, number, serial in arrivals:
             self._arrive(at_ns, self._lines[number], serial)
-        ahead = self._ahead
-        while ahead and ahead[0][0] <= until_ns:
-            _, line, serial = ahead.popleft()
+        in_service = self._in_service
+        while in_service and in_service[0][0] <= until_ns:
+            _, line, serial = in_service.popleft()
             line.served.append(serial)
             self.count += 1
             self.service_ns += line.service_ns
@@ -194,7 +194,7 @@ class BoardInbox:
         if end_ns is None:
             line.lost += 1
         else:
-            self._ahead.append((end_ns, line, serial))
+            self._in_service.append((end_ns, line, serial))
 
 
 def open_inbox(segment: Segment, task: str) -> BoardInbox | None:

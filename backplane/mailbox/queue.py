@@ -263,8 +263,8 @@ class QueueReader(Reader):
         """
         if serial > last:
             return False
-        ahead = self.slots.visible_at(serial) - tick
-        return ahead <= 0 or (ahead > self._farthest and not self.slots.fetch(serial))
+        ticks_ahead = self.slots.visible_at(serial) - tick
+        return ticks_ahead <= 0 or (ticks_ahead > self._farthest and not self.slots.fetch(serial))
 
     def close(self) -> None:
         """Release the claim of the reader's position."""

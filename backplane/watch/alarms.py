@@ -167,14 +167,14 @@ class AlarmWriter:
             text: Text of a level about its finding.
         """
         count = self._head[0] + 1
-        found = tick if since is None else since
+        since_tick = tick if since is None else since
         self._slots[count % ALARM_DEPTH] = (
             tick,
             monotonic_ns(),
             code,
             subject,
             value,
-            found,
+            since_tick,
             text.encode("utf-8", "replace"),
         )
         self._head[0] = count

@@ -52,14 +52,14 @@ class MessageWatch:
 
     def judge(self, tick: int) -> None:
         """Judge the messages found by the read at `tick`."""
-        found = self._reader.found
+        newest_serial = self._reader.found
         if self.seen < 0:
-            self._begin(found)
-        elif found > self.seen:
-            if found - self.seen > 1 and self._is_babble(found, tick):
-                self._begin(found)
+            self._begin(newest_serial)
+        elif newest_serial > self.seen:
+            if newest_serial - self.seen > 1 and self._is_babble(newest_serial, tick):
+                self._begin(newest_serial)
             else:
-                self._walk(found, tick)
+                self._walk(newest_serial, tick)
         if self._reader.statistics.held_up != self._held_up:
             self._held_up = self._reader.statistics.held_up
             self._find(Alarm.LOCKED, tick)
@@ -74,29 +74,31 @@ class MessageWatch:
         """Copy a message into the local record. Returns False if it is missing or not trusted."""
         return self._slots.fetch(serial) and self._slots.keeps(serial)
 
-    def _is_babble(self, found: int, tick: int) -> bool:
+    def _is_babble(self, newest_serial: int, tick: int) -> bool:
         """Check whether there are at least two messages more than releases."""
         slots = self._slots
-        if not slots.keeps(found):
+        if not slots.keeps(newest_serial):
             # The message is already overwritten. A writer of one message per cycle is slower.
-            found = slots.box[0]
-        if not self._copies(found):
+            newest_serial = slots.box[0]
+        if not self._copies(newest_serial):
             return False
-        count = found - self.seen
+        count = newest_serial - self.seen
         cycles = (slots.tick - self.newest) // self._spec.every
         if count <= cycles + 1:
             return False
         self._find(Alarm.BABBLE, tick, count / max(1, cycles))
         return True
 
-    def _walk(self, found: int, tick: int) -> None:
+    def _walk(self, newest_serial: int, tick: int) -> None:
         """Judge the messages one by one, up to the newest one found."""
         slots = self._slots
         mask = slots.mask
         taken = self._reader.serial
         late = self.late_from
         # A late reader cannot judge messages that are overwritten.
-        for serial in range(max(self.seen + 1, oldest_kept(slots.box[0], slots.depth)), found + 1):
+        for serial in range(
+            max(self.seen + 1, oldest_kept(slots.box[0], slots.depth)), newest_serial + 1
+        ):
             head = slots.heads[serial & mask]
             released = head[Slot.TICK]
             # The reader has checked only the message that it took.

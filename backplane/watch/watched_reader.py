@@ -79,14 +79,14 @@ class Watched(ABC):
 
     def _report(self, tick: int) -> None:
         """Count a bad read for the task, and raise alarms for a damaged or forged message."""
-        found = self._statistics
+        statistics = self._statistics
         accesses = self.reader.accesses
         self._task.troubles += 1
-        if found.corrupt != self._reported.corrupt:
+        if statistics.corrupt != self._reported.corrupt:
             self._episodes.find(Alarm.DAMAGED, accesses, tick)
-        if found.forged != self._reported.forged:
-            self._episodes.find(Alarm.MASQUERADE, accesses, tick, found.forger)
-        self._reported = copy(found)
+        if statistics.forged != self._reported.forged:
+            self._episodes.find(Alarm.MASQUERADE, accesses, tick, statistics.forger)
+        self._reported = copy(statistics)
 
 
 class WatchedReader(Watched):
@@ -211,8 +211,10 @@ class GridReader:
     def __init__(self, watched: Watched, grid: TickGrid) -> None:
         self.reader = watched.reader
         self._watched, self._every, self._phase = watched, *grid
-        kept = [Reading(self.reader.message, verdict) for verdict in (Verdict.NONE, Verdict.OLD)]
-        self._kept = [(reading, reading._replace(is_lost=True)) for reading in kept]
+        repeated = [
+            Reading(self.reader.message, verdict) for verdict in (Verdict.NONE, Verdict.OLD)
+        ]
+        self._kept = [(reading, reading._replace(is_lost=True)) for reading in repeated]
         self._was_lost = False
 
     def read(self, tick: int) -> Reading[AnyMessage]:

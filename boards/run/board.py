@@ -83,12 +83,12 @@ def _describe_failure(segment: Segment, name: str, error: Exception) -> str:
     if name in segment.map.blocks:
         block = segment.block(name)
         place = crc32("".join(traceback.format_tb(error.__traceback__)).encode())
-        last_place, again = divmod(block[Block.FAILED], REPEATS)
-        again = again + 1 if place == last_place else 0
-        block[Block.FAILED] = place * REPEATS + again
-        if again:
+        last_place, repeats = divmod(block[Block.FAILED], REPEATS)
+        repeats = repeats + 1 if place == last_place else 0
+        block[Block.FAILED] = place * REPEATS + repeats
+        if repeats:
             reason = "".join(traceback.format_exception_only(error)).rstrip()
-            return f"board '{name}' failed in the same place, {again} more so far: {reason}"
+            return f"board '{name}' failed in the same place, {repeats} more so far: {reason}"
     return f"board '{name}' failed:\n{traceback.format_exc().rstrip()}"
 
 

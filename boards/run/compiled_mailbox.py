@@ -80,12 +80,12 @@ def take(port: Any, serial: int) -> bool:
     copy(port.record, slot, SIGNED_FROM)
     fence()
     copy(port.record + SIGNED_FROM, slot + SIGNED_FROM, port.size - SIGNED_FROM)
-    found = slot_at(port.record)
+    received = slot_at(port.record)
     state = state_at(port.state)
-    if found.serial != serial or found.signature != state.signature:
+    if received.serial != serial or received.signature != state.signature:
         return False
-    check: int = xxh3(port.record + CHECKED_FROM, port.size - CHECKED_FROM, found.chain)
-    if check != found.check:
+    check: int = xxh3(port.record + CHECKED_FROM, port.size - CHECKED_FROM, received.chain)
+    if check != received.check:
         return False
     copy(port.state + GOOD, port.record, port.size)
     state.transfers += 1

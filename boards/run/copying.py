@@ -170,10 +170,10 @@ class Copier:
         while True:
             for fd, offset in offsets.items():
                 # Open the file for this process alone, and read it up to `offset`.
-                again = os.open(f"/proc/self/fd/{fd}", os.O_RDONLY | os.O_CLOEXEC)
-                os.lseek(again, offset, os.SEEK_SET)
-                os.dup2(again, fd)
-                os.close(again)
+                reopened = os.open(f"/proc/self/fd/{fd}", os.O_RDONLY | os.O_CLOEXEC)
+                os.lseek(reopened, offset, os.SEEK_SET)
+                os.dup2(reopened, fd)
+                os.close(reopened)
             # Python reseeds its generator in a fork.
             random.setstate(seeds)
             try:
@@ -194,7 +194,7 @@ class Copier:
             memory: Files of the clock, which are permitted.
         """
         segment = os.fstat(self._segment.fd)
-        found = [
+        resources = [
             f"it holds {name}"
             for fd, name in _open_files().items()
             if self._before.get(fd) != name
@@ -204,19 +204,19 @@ class Copier:
             and not _is_only_read(fd)
         ]
         threads = [path for path in _THREADS.iterdir() if path.name != str(os.getpid())]
-        return found + [
+        return resources + [
             f"it has the thread {(path / 'comm').read_text().strip()}" for path in threads
         ]
 
 
 def _open_files() -> dict[int, str]:
     """Return the open files of this process with their names."""
-    found = {}
+    name_by_descriptor = {}
     for entry in [*_DESCRIPTORS.iterdir()]:
         # The descriptor of the listing itself is closed by now.
         with suppress(FileNotFoundError):
-            found[int(entry.name)] = str(entry.readlink())
-    return found
+            name_by_descriptor[int(entry.name)] = str(entry.readlink())
+    return name_by_descriptor
 
 
 def _is_only_read(fd: int) -> bool:

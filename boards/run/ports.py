@@ -69,21 +69,27 @@ class InputPorts:
             values = level.input_table(port)
             if not isinstance(source, str):
                 values[port] = values = {}
-            how = (exchange or {}).get(port)
+            rule = (exchange or {}).get(port)
             open_port = partial(
                 watched, segment, alarms=alarms, task=self.task, room=partial(level.room, port)
             )
             for key, mailbox in boxes.items():
                 if port in level.inputs:
                     segment.message_classes[mailbox] = level.inputs[port].message
-                found = open_port(mailbox, asynchronous=how is not None and how.asynchronous)
-                read = found.read if how is None else GridReader(found, how.grid).read
+                watched_reader = open_port(
+                    mailbox, asynchronous=rule is not None and rule.asynchronous
+                )
+                read = (
+                    watched_reader.read
+                    if rule is None
+                    else GridReader(watched_reader, rule.grid).read
+                )
                 """Read every mailbox as of `tick`."""
-                values[key] = Reading(found.reader.message, Verdict.NONE)
-                line = Line(values, key, read, found)
+                values[key] = Reading(watched_reader.reader.message, Verdict.NONE)
+                line = Line(values, key, read, watched_reader)
                 (plans if mailbox == plan else self._rest).append(line)
-                self.taken.append(Taken(values, key, found.reader))
-                self.readers[mailbox] = found.reader
+                self.taken.append(Taken(values, key, watched_reader.reader))
+                self.readers[mailbox] = watched_reader.reader
         self.reads_plan = bool(plans)
         self._plan_table = ReadTable(plans)
         self._table = ReadTable(self._rest)
@@ -99,16 +105,16 @@ class InputPorts:
             queue: Writer of the queue.
             alarms: Ring for alarms about faults of messages.
         """
-        found = watched(segment, taken_name(queue.spec.name), alarms, self.task)
+        position_reader = watched(segment, taken_name(queue.spec.name), alarms, self.task)
 
         def read_and_note(tick: int) -> Reading[AnyMessage]:
-            reading = found.read(tick)
+            reading = position_reader.read(tick)
             queue.taken = reading.message.taken
             return reading
 
-        self._rest.append(Line({}, "", read_and_note, found))
+        self._rest.append(Line({}, "", read_and_note, position_reader))
         self._table = ReadTable(self._rest)
-        self._readers.append(found.reader)
+        self._readers.append(position_reader.reader)
 
     def read(self, tick: int) -> None:
         """Read every mailbox as of `tick`."""

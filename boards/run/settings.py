@@ -50,10 +50,10 @@ class _Change:
         for name in attribute_names(before):
             if hasattr(live, name) and hasattr(after, name):
                 now = getattr(live, name)
-                wanted = self._merged(now, getattr(before, name), getattr(after, name))
-                if wanted is not now:
+                changed = self._merged(now, getattr(before, name), getattr(after, name))
+                if changed is not now:
                     # This works for frozen dataclasses, too.
-                    object.__setattr__(live, name, wanted)
+                    object.__setattr__(live, name, changed)
 
     def _merged(self, now: Any, old: Any, new: Any) -> Any:
         """Return a value after the change from `old` to `new`. Objects are changed in place."""
@@ -86,5 +86,5 @@ def has_attributes(thing: object) -> bool:
 def attribute_names(thing: object) -> Iterable[str]:
     """Return the names of an object's attributes, including slots."""
     slots = [getattr(kind, "__slots__", ()) for kind in type(thing).__mro__]
-    names = [name for found in slots for name in found if hasattr(thing, name)]
+    names = [name for slot_names in slots for name in slot_names if hasattr(thing, name)]
     return [*getattr(thing, "__dict__", ()), *names]

@@ -96,20 +96,22 @@ class ClockCopies:
             The next tick before which a snapshot is due.
         """
         words = self._segment.words
-        wanted = words[System.SNAPSHOT_AT] - 1
+        requested_tick = words[System.SNAPSHOT_AT] - 1
         part, every = words[System.SNAPSHOT_PART], words[System.SNAPSHOT_EVERY]
         is_due = (every > 0 and tick >= self._taken_at + every) or (
             part > 0 and time.monotonic() >= self._not_before_s
         )
-        if tick == wanted or is_due:
+        if tick == requested_tick or is_due:
             tasks = self._driver.tasks
             self._driver.settle()
             are_there = [task.is_settled() and not task.is_lost | task.is_stopped for task in tasks]
             if all(are_there) and self._take(tick):
                 # This is the copy. Apply the snapshot policy of the rack that continues from it.
                 return self(tick)
-        ahead = wanted if wanted > tick else sys.maxsize
-        return min(ahead, max(self._taken_at + every, tick + 1)) if every else ahead
+        next_requested = requested_tick if requested_tick > tick else sys.maxsize
+        return (
+            min(next_requested, max(self._taken_at + every, tick + 1)) if every else next_requested
+        )
 
     def _take(self, tick: int) -> bool:
         """Take a snapshot. Returns True in a copy of the clock that continues from it."""

@@ -118,9 +118,9 @@ class Stopwatch:
         if state != self._state:
             self._state = block[Block.LEVEL_STATE] = state
             block[Block.LEVEL_SINCE] = tick
-        used = thread_time_ns()
-        before = self._processor_ns
-        self._processor_ns = used
+        used_ns = thread_time_ns()
+        used_before_ns = self._processor_ns
+        self._processor_ns = used_ns
         self._trace.write(
             tick,
             self._release_ns,
@@ -131,7 +131,7 @@ class Stopwatch:
             self.end_ns,
             flags,
             state,
-            used - before,
+            used_ns - used_before_ns,
             self._closed_ns,
         )
         self._cycles = block[Block.CYCLES] = self._cycles + 1

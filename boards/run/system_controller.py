@@ -165,9 +165,11 @@ class OperatorDesk:
             if box.writer == CLOCK
         }
         statuses = {at: f"{self._boxes[at].name.partition('.')[0]}.status" for at in self._writers}
-        there = {box.name for box in self._boxes if "order" in {field.name for field in box.fields}}
+        answering = {
+            box.name for box in self._boxes if "order" in {field.name for field in box.fields}
+        }
         self._statuses = {
-            at: open_observer(segment, name) for at, name in statuses.items() if name in there
+            at: open_observer(segment, name) for at, name in statuses.items() if name in answering
         }
         self.requested = -1
         self.next_tick = 0

@@ -190,13 +190,13 @@ def in_turn(*accesses: Callable[[int], None] | None) -> Callable[[int], None]:
 
     A single access is returned itself.
     """
-    found = [access for access in accesses if access is not None]
+    present = [access for access in accesses if access is not None]
 
     def make_all(tick: int) -> None:
-        for access in found:
+        for access in present:
             access(tick)
 
-    return make_all if len(found) > 1 else found[0]
+    return make_all if len(present) > 1 else present[0]
 
 
 def slowed(access: Callable[_P, _R], time_ns: int) -> Callable[_P, _R]:

@@ -123,9 +123,9 @@ def test_a_refusal_names_the_limit_that_is_reached() -> None:
     files = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
     processes = resource.getrlimit(resource.RLIMIT_NPROC)[0]
     text = refusal(OSError(errno.EMFILE, "Too many"))
-    assert text == f"Too many: at most {files} open files are permitted (ulimit -n)"
+    assert text == f"Too many: the limit is {files} open files (ulimit -n)"
     text = refusal(OSError(errno.EAGAIN, "Not now"))
-    assert text == f"Not now: at most {processes} processes are permitted (ulimit -u)"
+    assert text == f"Not now: the limit is {processes} processes (ulimit -u)"
     assert refusal(OSError(errno.EACCES, "No")) == f"[Errno {errno.EACCES}] No"
 
 
