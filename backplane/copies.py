@@ -84,7 +84,7 @@ def fill_memory(segment: Segment, fd: int, tick: int) -> None:
 def leave(segment: Segment) -> None:
     """Detach a forked process from its segment: release the memory, the file and the locks.
 
-    The process must not use the segment again before it calls `enter`.
+    The process must not use the segment again before it calls `switch_segment`.
     """
     byte_lock.close_all()
     _map(segment, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS, 0, -1)

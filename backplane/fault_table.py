@@ -142,7 +142,7 @@ class FaultTable:
         return entry
 
     def disarm(self, entry: FaultEntry) -> None:
-        """Keep a waiting fault from beginning. `free` may be called after the next tick."""
+        """Keep a waiting fault from beginning. `free_entry` may be called after the next tick."""
         # The order matters: without a condition and with a tick in the past, the fault would begin
         # at once.
         entry.tick = NEVER

@@ -128,7 +128,7 @@ class Message:
 
     Array fields are numpy views of `record`. Fill them in place (`m.position[:] = q`) or assign to
     them (`m.position = q`). Scalars are read and assigned as plain values, texts as `str` (see
-    `text_of`). A number that an enum does not name is read as a plain `int`, so no reader fails
+    `decode_text`). A number that an enum does not name is read as a plain `int`, so no reader fails
     because another board, or another version of a rack, sent it.
 
     Attributes:

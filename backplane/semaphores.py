@@ -44,8 +44,8 @@ class MappedMemory(Protocol):
 class Semaphore:
     """Semaphore in shared memory whose waits do not depend on the wall clock.
 
-    `release()` posts it. `wait()` waits until the time set by `bind` and returns 0 if it has
-    obtained the semaphore. A signal may end the wait early.
+    `release()` posts it. `wait()` waits until the time set by `set_deadline` and returns 0 if it
+    has obtained the semaphore. A signal may end the wait early.
     """
 
     def __init__(self, memory: memoryview, address: int) -> None:

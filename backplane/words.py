@@ -40,7 +40,7 @@ def switch(tick: int, is_on: bool) -> int:
 
 
 def is_on(word: int, tick: int) -> bool:
-    """Check whether a switch word (see `switch`) is on at `tick`."""
+    """Check whether a switch word (see `encode_switch`) is on at `tick`."""
     return bool(word & 1) == (tick >= word >> 1)
 
 
@@ -93,7 +93,7 @@ class System:
     HOLD_AT = 53
     # 1 + tick before which lockstep is holding now. 0 without a hold. Written by the clock.
     HELD = 54
-    # Switch (see `switch`) that is on while the arm must stop because another rack is lost.
+    # Switch (see `encode_switch`) that is on while the arm must stop because another rack is lost.
     # Written by the network adapter.
     PEER_STOP = 55
     SKIPPED_FROM = 56  # first of the ticks that the clock skipped last
@@ -206,7 +206,7 @@ class Box:
     # process id of the owner, 0 for none.
     OWNER = 4
     # Epoch and process of the writer in one number, as in every slot that it fills. See
-    # `slots.claim`.
+    # `slots.build_signature`.
     CLAIMANT = 5
     REFUSED = 6  # number of messages refused because the queue was full
     # Of a queue: serial of the newest message of its lawful writer. HEAD is greater after an
@@ -214,8 +214,8 @@ class Box:
     SENT = 7
     # Of a host board's mailbox: serial of the newest message that its bus adapter has taken.
     TAKEN = 8
-    # Of messages from another rack: switch (see `switch`) that is on while the other rack is lost,
-    # so that the writer counts as lost.
+    # Of messages from another rack: switch (see `encode_switch`) that is on while the other rack is
+    # lost, so that the writer counts as lost.
     VOID = 9
     # The same for racks that continue alone: the information does not grow too old while it is on.
     KEPT = 10

@@ -21,7 +21,7 @@ EXCHANGE = "exchange"
 """Name of the port and of the message type."""
 AGE = "age"
 TAKEN = "taken"
-"""Suffix of the names of fields with arrivals. `AGE` is the suffix for ages."""
+"""Suffix of the names of fields with arrivals. `AGE_SUFFIX` is the suffix for ages."""
 _NEW = Verdict.NEW  # for the hot path
 NEVER = -1
 """Tick of arrival before the first message."""
@@ -76,7 +76,7 @@ class Taken(NamedTuple):
 class ExchangeRecord:
     """Fills a board's exchange message from its inputs.
 
-    The inputs are in the order of `exchange_message`.
+    The inputs are in the order of `build_exchange_message`.
     """
 
     def __init__(self, inputs: Sequence[Taken], message: Message) -> None:

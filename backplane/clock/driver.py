@@ -53,7 +53,7 @@ class Controller(Protocol):
         """Do the work that is due after the release."""
 
     def rests_until(self, tick: int) -> int:
-        """Return the first tick after `tick` that needs `begin`, as far as is known."""
+        """Return the first tick after `tick` that needs `begin_tick`, as far as is known."""
 
 
 class ClockDriver(ABC):

@@ -91,5 +91,5 @@ def ticks_of(
 
 
 def rate_text(rate_hz: float) -> str:
-    """Format a rate in Hz with the digits that `ticks_of` needs to find its period."""
+    """Format a rate in Hz with the digits that `compute_period_ticks` needs to find its period."""
     return f"{rate_hz:.4g}"

@@ -4,8 +4,8 @@
 works a little ahead of the grid (`rack.backplane.clock.driver`). Its lateness is then the lateness
 of one wake-up, not of two in a row (clock, then task). If the release is missing, the clock is
 late, stopped, or has skipped a tick. The task sleeps until its next grid point, and the late clock
-wakes it with a post. A sleep of more than `NEAR_NS` is a wait for the task's semaphore until the
-grid point, so that the end of a run ends it. A shorter sleep takes less processor time.
+wakes it with a post. A sleep of more than `MAX_SLEEP_NS` is a wait for the task's semaphore until
+the grid point, so that the end of a run ends it. A shorter sleep takes less processor time.
 
 "signal": the task blocks on its semaphore until the clock posts it at the grid point.
 

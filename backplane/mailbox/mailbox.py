@@ -166,7 +166,7 @@ class Writer:
             tick: Release tick of the cycle that writes.
             visible_at: Tick from which the message is visible.
             basis: Tick of the oldest information on which the message depends.
-            damage: Bits to flip, see `Slots.publish`.
+            damage: Bits to flip, see `Slots.publish_message`.
 
         Returns:
             False if the access timed out.

@@ -90,7 +90,7 @@ class LockWriter(DoubleBufferWriter):
             tick: Release tick of the cycle that writes.
             visible_at: Tick from which the message is visible.
             basis: Tick of the oldest information on which the message depends.
-            damage: Bits to flip, see `Slots.publish`.
+            damage: Bits to flip, see `Slots.publish_message`.
 
         Returns:
             False if the wait for the lock timed out.

@@ -154,13 +154,13 @@ class QueueWriter(Writer):
         self.message.raw[:] = present
 
     def publish(self, tick: int, visible_at: int, basis: int, damage: Sequence[int] = ()) -> bool:
-        """Publish `message`, without showing it to readers before `show` is called.
+        """Publish `message`, without showing it to readers before `show_published` is called.
 
         Args:
             tick: Release tick of the cycle that writes.
             visible_at: Tick from which the message is visible.
             basis: Tick of the oldest information on which the message depends.
-            damage: Bits to flip, see `Slots.publish`.
+            damage: Bits to flip, see `Slots.publish_message`.
         """
         self.slots.publish(tick, visible_at, basis, damage)
         return True

@@ -9,7 +9,7 @@ loads the serial with acquire before it copies the slot, so it sees all of the s
 still be torn by a writer that laps the reader, which the checksum detects. The checksum does not
 cover the signature. The signature is stored after the message and loaded before it, so that a
 forged message that is being overwritten never carries the signature of the true writer. Before a
-reader concludes from a head that a slot has not been reused (`keeps`), its copy is complete. In
+reader concludes from a head that a slot has not been reused (`is_kept`), its copy is complete. In
 turn the writer fills no slot before the previous head is stored. Words are aligned to 8 bytes, so
 they are never torn.
 
@@ -20,10 +20,10 @@ protocol exhaustively.
 
 The checksum is XXH3 with 64 bits, seeded with the checksum of the previous message. One pass over a
 message tells a reader whether its copy is complete and undamaged. The newest checksum covers all
-that was ever written, so one comparison shows whether two runs are equal (`history.digest`).
-Alternatives considered: CRC32 and a chained hash, two passes that took half of a write; and a
-seeded CRC32 alone, whose 32 bits are few for a digest and which takes five times as long on 200
-bytes.
+that was ever written, so one comparison shows whether two runs are equal
+(`history.compute_digest`). Alternatives considered: CRC32 and a chained hash, two passes that took
+half of a write; and a seeded CRC32 alone, whose 32 bits are few for a digest and which takes five
+times as long on 200 bytes.
 """
 
 from __future__ import annotations
@@ -105,8 +105,9 @@ class Slots:
     """
 
     # Words of the local record: time of publication (CLOCK_MONOTONIC), signature of the writer
-    # (see `claim`), checksum over this and every earlier message of the mailbox, serial (0 without
-    # a message), release tick of the writing cycle, and tick from which the message is visible.
+    # (see `build_signature`), checksum over this and every earlier message of the mailbox, serial
+    # (0 without a message), release tick of the writing cycle, and tick from which the message is
+    # visible.
     stamp_ns = Word(Slot.STAMP_NS)
     signature = Word(Slot.EPOCH)
     chain = Word(Slot.CHECK)
@@ -245,7 +246,11 @@ class Slots:
                 yield copied(self.message)
 
     def copy(self, serial: int) -> bool:
-        """Copy the slot of a serial as `load` does. Returns False if it was reused meanwhile."""
+        """Copy the slot of a serial as `load_slot` does.
+
+        Returns:
+            False if the slot was reused during the copy.
+        """
         self.load(serial)
         return self.keeps(serial)
 

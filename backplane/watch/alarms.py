@@ -38,8 +38,8 @@ NO_TORQUE = -2
 AT_START = -3
 """Reasons for engaged brakes that no error describes.
 
-The brakes engaged on a demand (`BY_DEMAND`), because no torque came in time (`NO_TORQUE`), or
-because no torque had come yet (`AT_START`).
+The brakes engaged on a demand (`BRAKED_BY_DEMAND`), because no torque came in time
+(`BRAKED_WITHOUT_TORQUE`), or because no torque had come yet (`BRAKED_AT_START`).
 """
 
 
@@ -93,7 +93,7 @@ class Alarm(IntEnum):
     ACTUATOR = 44  # [joint; residual]  the arm does not follow its torques
     COMMAND_INVALID = 45  # [joint; -]  rejected: a torque is NaN or infinite
     COMMAND_LIMIT = 46  # [joint; N m]  a torque beyond its limit was cut
-    # [error of the level, 0: the boards above, or `BY_DEMAND` ...; ticks without]
+    # [error of the level, 0: the boards above, or `BRAKED_BY_DEMAND` ...; ticks without]
     BRAKES_CLOSED = 47
     BRAKES_OPENED = 48  # [as they engaged; ticks they were engaged]
     RE_REFERENCED = 49  # [joint; distance from its estimate, rad]  its sensor is trusted again

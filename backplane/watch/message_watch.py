@@ -3,7 +3,7 @@
 Messages are judged in serial order. A fault is reported only on evidence that a slow machine cannot
 produce: a serial whose slot was never filled, a later serial with an earlier tick, two messages for
 one release, or a message stamped after the end of the cycle that made it. The reader may be delayed
-too. Therefore a message is copied first, its slot is checked for reuse (`Slots.keeps`), and only
+too. Therefore a message is copied first, its slot is checked for reuse (`Slots.is_kept`), and only
 then is the copy judged.
 """
 

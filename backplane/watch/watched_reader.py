@@ -163,7 +163,7 @@ class SporadicReader(Watched):
 
 
 class WatchedQueue(Watched):
-    """Reader of a queue, which takes as many messages as the task has `room` for.
+    """Reader of a queue, which takes as many messages as the task has room for.
 
     Silence proves nothing, because a queue is written on demand. Only a writer found dead or
     hanging counts as lost.

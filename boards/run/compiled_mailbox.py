@@ -53,7 +53,10 @@ _SIGNATURE = 8 * Slot.EPOCH
 _VISIBLE = 8 * Slot.VISIBLE_AT
 _PORT_SIZE = PORT.itemsize
 OLD, NEW, ODD, SILENT, SLOW = 0, 1, 2, 4, 8
-"""Results of a read. ODD and SILENT: Python judges messages or silence. SLOW: Python reads."""
+"""Results of a read.
+
+The last three ask Python to judge the messages, to judge the silence, or to do the read itself.
+"""
 MOST_PORTS = 60
 """Maximum number of ports of a table, since each has a bit in the result of a call."""
 
@@ -72,7 +75,7 @@ def slot_of(port: Any, serial: int) -> int:
 
 @compiled
 def take(port: Any, serial: int) -> bool:
-    """Accept a good message of the same writer as before, as `Reader._obtain` does.
+    """Accept a good message of the same writer as before, as `Reader._fetch_good` does.
 
     Any other message is left to Python.
     """
@@ -123,7 +126,11 @@ def read_port(port: Any, tick: int) -> int:
 
 @compiled
 def publish(port: Any, tick: int, stamp: int) -> int:
-    """Publish the message of a port's record as `Slots.publish` does, and return the intruder."""
+    """Publish the message of a port's record as `Slots.publish_message` does.
+
+    Returns:
+        Process id of an intruder, 0 for none.
+    """
     record = slot_at(port.record)
     before = record.serial
     slot = slot_of(port, before + 1)

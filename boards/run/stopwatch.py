@@ -27,8 +27,8 @@ BUS_COUNT_CYCLES = 64
 class Stopwatch:
     """Times one task.
 
-    A cycle calls `start`, stamps the end of each part, and calls `finish` or `idle`. Stamps are
-    times of CLOCK_MONOTONIC.
+    A cycle calls `start_cycle`, stamps the end of each part, and calls `finish_cycle` or
+    `finish_idle_cycle`. Stamps are times of CLOCK_MONOTONIC.
     """
 
     def __init__(

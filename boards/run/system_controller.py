@@ -86,7 +86,7 @@ class SystemController:
         self._faults.within(tick)
 
     def rests_until(self, tick: int) -> int:
-        """Return the first tick after `tick` that needs `begin` or may end the run."""
+        """Return the first tick after `tick` that needs `begin_tick` or may end the run."""
         if self._settled is None:
             return tick + 1
         return min(self._faults.next_tick, self._desk.next_tick, self._end_of_run.next_tick)
