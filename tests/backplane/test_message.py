@@ -126,7 +126,7 @@ class Lamp(Message, version=1):
     colour: Colour = field(doc="")
 
 
-def test_flags_and_names_read_as_what_they_are() -> None:
+def test_flags_read_as_bools_and_names_as_enum_members() -> None:
     lamp = Lamp.zeros({})
     lamp.on, lamp.colour = True, Colour.BLUE
     assert (lamp.on, lamp.colour) == (True, Colour.BLUE)

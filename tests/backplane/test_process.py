@@ -42,7 +42,7 @@ from tests.processes import FORKS, descriptors, exit_status, fork, forked, wait_
 pytestmark = pytest.mark.filterwarnings(FORKS)
 
 
-def test_a_running_process_is_alive_under_its_own_start_alone() -> None:
+def test_a_running_process_is_alive_only_with_its_start_time() -> None:
     started = start_time(os.getpid())
     assert started > 0
     assert is_alive(os.getpid())
@@ -52,7 +52,7 @@ def test_a_running_process_is_alive_under_its_own_start_alone() -> None:
     assert not is_alive(-1)
 
 
-def test_a_name_with_parentheses_and_spaces_does_not_confuse() -> None:
+def test_a_process_name_may_contain_parentheses_and_spaces() -> None:
     def rename() -> None:
         name_process(") S 1 (x) 2")
         time.sleep(60)
@@ -96,7 +96,7 @@ def test_the_kernel_says_in_which_state_a_process_is() -> None:
     assert (state_of(pid), processor_ns(pid), mapped_and_locked(pid)) == ("X", 0, (0, 0))
 
 
-def test_processor_time_is_that_of_the_process() -> None:
+def test_processor_time_excludes_other_processes() -> None:
     target = time.process_time_ns() + 30_000_000
     compute_until(target)
     used = time.process_time_ns()
@@ -167,7 +167,7 @@ SCHED_DEADLINE = 6
 
 
 @needs_deadlines
-def test_a_reservation_is_that_of_the_process_itself_on_its_core_or_on_any() -> None:
+def test_a_reservation_applies_to_the_process_on_its_core_or_on_any_core() -> None:
     cores = os.sched_getaffinity(0)
 
     def take() -> bool:

@@ -43,7 +43,7 @@ def refusal(attach: Callable[[], object]) -> str:
     return str(error.value)
 
 
-def test_segment_is_its_users_alone_and_all_of_it_is_allocated(make_bus: MakeBus) -> None:
+def test_a_segment_is_private_to_its_user_and_fully_allocated(make_bus: MakeBus) -> None:
     segment = make_bus(mailbox())
     found = shm_path(segment.rack).stat()
     assert stat.S_IMODE(found.st_mode) == 0o600
@@ -51,7 +51,7 @@ def test_segment_is_its_users_alone_and_all_of_it_is_allocated(make_bus: MakeBus
     assert found.st_blocks * 512 >= found.st_size
 
 
-def test_whoever_attaches_finds_layout_config_and_the_same_memory(make_bus: MakeBus) -> None:
+def test_attached_processes_find_layout_config_and_the_same_memory(make_bus: MakeBus) -> None:
     made = make_bus(mailbox(), mailbox("lock", name="writer.other"), config='name = "näme"\n')
     found = Segment.attach(made.rack)
     assert found.layout == made.layout
@@ -202,7 +202,7 @@ def test_a_creator_killed_anywhere_leaves_a_whole_segment_or_none(rack_name: str
     assert complete
 
 
-def test_a_launcher_lives_until_it_gives_its_lock_back(make_bus: MakeBus) -> None:
+def test_a_launcher_counts_as_alive_until_it_releases_its_lock(make_bus: MakeBus) -> None:
     segment = make_bus()
     # Record locks of a process would be gone by now.
     Segment.attach(segment.rack).close()
@@ -247,7 +247,7 @@ def test_a_launcher_of_another_pid_namespace_has_no_process_id_here(make_bus: Ma
     assert (segment.launcher, segment.launcher_is_alive) == (0, True)
 
 
-def test_a_segment_knows_when_its_name_means_another(make_bus: MakeBus) -> None:
+def test_a_segment_detects_that_its_name_leads_to_another(make_bus: MakeBus) -> None:
     first = make_bus()
     assert first.has_its_name
     unlink(first.rack)

@@ -176,7 +176,7 @@ def test_brakes_hold_a_run_if_they_are_long_or_often_engaged(
 
 
 @pytest.mark.parametrize("kind", ["fault", "command"])
-def test_with_a_cause_in_sight_nothing_is_held(bus: Segment, kind: Any) -> None:
+def test_holds_with_a_known_cause_are_not_reported(bus: Segment, kind: Any) -> None:
     assert list(ending(bus).held([Event(0, 0, "miss", "", "")], [LONG], RAN_MS))
     assert not list(ending(bus).held([Event(0, 0, kind, "", "")], [LONG], RAN_MS))
     bus.words[System.DEMAND] = 1
@@ -218,7 +218,7 @@ def test_objects_end_where_they_were_sensed_last(bus: Segment) -> None:
     assert str(end) == "object 'block' ended 4 mm from its goal (tolerance 5 mm)"
 
 
-def test_a_journal_stamps_what_happens_and_passes_it_on(bus: Segment) -> None:
+def test_a_journal_stamps_events_and_passes_them_on(bus: Segment) -> None:
     heard: list[Event] = []
     journal = Journal(heard.append)
     journal.add("launch", "rack", "first")
@@ -237,7 +237,7 @@ def test_a_journal_stamps_what_happens_and_passes_it_on(bus: Segment) -> None:
     Journal(None).add("launch", "rack", "nobody listens")
 
 
-def test_brakings_are_those_reported_as_over_and_the_one_that_lasts_to_the_end() -> None:
+def test_brakings_include_finished_ones_and_the_one_at_the_end() -> None:
     def change(tick: int, code: str, why: str, value: int = 0) -> Event:
         return Event(0, tick, "reaction", "arm", "", code, subject=why, value=value)
 

@@ -32,7 +32,7 @@ LOST: tuple[dict[str, Any], ...] = (
 
 
 @pytest.mark.parametrize("case", RACKS)
-def test_the_clock_of_a_rack_does_what_it_did(
+def test_the_recorded_run_of_the_clock_is_unchanged(
     case: str,
     config: MakeConfig,  # noqa: F811
 ) -> None:

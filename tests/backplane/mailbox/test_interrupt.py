@@ -111,7 +111,7 @@ def test_a_message_written_in_the_tick_in_which_it_is_due_is_late(make_bus: Make
     assert [writer.visible_at(8, now) for now in (None, 8, 10, 11, 12)] == [11, 11, 11, 12, 13]
 
 
-def test_one_that_is_served_across_a_release_shows_at_the_next(make_bus: MakeBus) -> None:
+def test_a_message_served_across_a_release_is_visible_at_the_next(make_bus: MakeBus) -> None:
     # Each takes 0.9 ms: from 0.5 ms on the handler is done at 1.4, 2.3 and 3.2 ms, with a release
     # at 2.5.
     board = Board(make_bus(*boxes(service_ns=900_000), *tasks()))
@@ -122,7 +122,7 @@ def test_one_that_is_served_across_a_release_shows_at_the_next(make_bus: MakeBus
     assert (board.inbox.count, board.inbox.service_ns) == (3, 2_700_000)
 
 
-def test_a_full_inbox_loses_what_comes_last_at_this_board_only(make_bus: MakeBus) -> None:
+def test_a_full_inbox_loses_the_last_messages_at_this_board_only(make_bus: MakeBus) -> None:
     board = Board(make_bus(*boxes(depth=1), *tasks()))
     for tick in range(5):
         board.send(tick)

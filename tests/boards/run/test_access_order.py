@@ -194,7 +194,7 @@ PYTHON_MUTANTS: dict[str, tuple[type, str, str, str]] = {
 
 
 @pytest.mark.parametrize("mistake", PYTHON_MUTANTS)
-def test_a_mistake_in_python_shows_in_the_order(
+def test_a_mutant_of_the_python_classes_changes_the_order(
     make_bus: MakeBus, accesses: list[str], monkeypatch: pytest.MonkeyPatch, mistake: str
 ) -> None:
     owner, method, before, after = PYTHON_MUTANTS[mistake]
@@ -300,7 +300,7 @@ MACHINE_MUTANTS: dict[str, tuple[str, str, str]] = {
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("mistake", MACHINE_MUTANTS)
-def test_a_mistake_in_machine_code_shows_in_the_order(
+def test_a_mutant_of_the_compiled_code_changes_the_order(
     compile_all: Callable[[], None], monkeypatch: pytest.MonkeyPatch, mistake: str
 ) -> None:
     name, before, after = MACHINE_MUTANTS[mistake]
