@@ -133,4 +133,5 @@ def operator_entry_size(layout: Layout) -> int:
 
 
 def _up(value: int, step: int) -> int:
+    """Round `value` up to a multiple of `step`."""
     return -(-value // step) * step

@@ -95,6 +95,7 @@ class ProcessLock(ByteLock):
 
 def _close_inherited() -> None:
     # The parent keeps its lock, which belongs to the file description that both have open.
+    """Close the locks that a forked child must not keep."""
     for lock in [*_HELD]:
         lock.close()
 
@@ -122,4 +123,5 @@ def is_locked(fd: int, address: int) -> bool:
 
 
 def _one_byte(kind: int, address: int) -> bytes:
+    """Pack a `struct flock` that concerns one byte."""
     return _FLOCK.pack(kind, os.SEEK_SET, address, 1, 0)

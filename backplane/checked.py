@@ -35,7 +35,7 @@ def as_whole(number: float) -> int:
         DamageError: The number is NaN or infinite.
     """
     if not isfinite(number):
-        raise DamageError(f"{number} in place of a whole number")
+        raise DamageError(f"{number} is not a whole number")
     return int(number)
 
 
@@ -51,5 +51,5 @@ def pick(items: Sequence[T], index: int, what: str) -> T:
         DamageError: The index is out of range.
     """
     if not 0 <= index < len(items):
-        raise DamageError(f"{index} is not the number of a {what}; there are {len(items)}")
+        raise DamageError(f"{index} is not the index of a {what}; there are {len(items)}")
     return items[index]

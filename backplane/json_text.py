@@ -19,6 +19,7 @@ def encode_json(document: Any, indent: int | None = None) -> str:
 
 
 def _replace_infinite(value: Any) -> Any:
+    """Return a copy of plain data in which None replaces NaN and infinities."""
     if isinstance(value, dict):
         return {key: _replace_infinite(inner) for key, inner in value.items()}
     if isinstance(value, list | tuple):

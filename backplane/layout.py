@@ -118,7 +118,7 @@ class FieldSpec:
 
     def __post_init__(self) -> None:
         if not KIND.fullmatch(self.kind):
-            raise ValueError(f"a field of kind {self.kind}")
+            raise ValueError(f"a field cannot have the kind {self.kind}")
 
 
 @dataclass(frozen=True)

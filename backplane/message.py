@@ -102,7 +102,7 @@ def _named(declared: Field, name: str, hint: Any) -> Field:
         raise ValueError(f"shape {declared.shape} does not suit {_name(hint)}")
     unit = hint if python is IntEnum else _UNITS.get(python, declared.unit)
     if unit == _UNSTATED:
-        raise ValueError('has no unit; of a pure number it is "1"')
+        raise ValueError('has no unit; the unit of a pure number is "1"')
     default = declared.default
     if default is not None and not _holds(kind, default):
         raise ValueError(f"default {default!r} does not fit numpy type '{kind}'")
@@ -161,7 +161,8 @@ class Message:
                 is_taken = hasattr(Message, name) or name in Message.__annotations__
                 if name.startswith("_") or is_taken or name not in hints:
                     raise ValueError(
-                        "permitted: annotated, no leading '_', no attribute of Message"
+                        "must be annotated, without leading '_', and not named like an attribute"
+                        " of Message"
                     )
                 fields[name] = _named(declared, name, hints[name])
             except (TypeError, ValueError) as error:
@@ -216,6 +217,7 @@ class Message:
             raise AttributeError(self._unknown(name))
 
     def _unknown(self, name: str) -> str:
+        """Describe an access to an unknown field, with the nearest field name."""
         names = self.record.dtype.names or ()
         near = get_close_matches(name, names, 1)
         hint = f"did you mean '{near[0]}'?" if near else f"fields: {', '.join(names)}"
@@ -290,6 +292,7 @@ def fill_counts(record: Any, counts: Iterable[float]) -> None:
 
 @cache
 def _greatest(kind: np.dtype) -> float:
+    """Return the largest value that a numpy type can store."""
     return np.iinfo(kind).max if kind.kind in "iu" else np.inf
 
 
@@ -310,6 +313,7 @@ def _resolved(cls: type[B], dtype: np.dtype) -> type[B]:
 
 
 def _scalar(name: str, dtype: np.dtype, declared: Field | None) -> property:
+    """Build the property that reads a scalar field as a plain Python value."""
     if dtype.kind == "S":
         return property(lambda self: text_of(self._views[name].item()))
     if declared is not None and declared.python is bool:
@@ -321,6 +325,7 @@ def _scalar(name: str, dtype: np.dtype, declared: Field | None) -> property:
 
 
 def _name(hint: Any) -> str:
+    """Return the name of an annotation for an error message."""
     return str(getattr(hint, "__name__", hint))
 
 

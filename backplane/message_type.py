@@ -66,6 +66,7 @@ class MessageType:
         return np.dtype([self._column(f, sizes) for f in self.fields], align=True)
 
     def _column(self, field: Field, sizes: Mapping[str, int]) -> tuple[str, Any, tuple[int, ...]]:
+        """Return the entry of the numpy dtype for one field: name, type and shape."""
         kind = (
             field.kind.dtype(sizes) if isinstance(field.kind, MessageType) else np.dtype(field.kind)
         )

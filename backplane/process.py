@@ -53,6 +53,7 @@ def processor_ns(pid: int) -> int:
 
 
 def _stat(pid: int) -> list[str]:
+    """Return the fields of /proc/<pid>/stat after the command name, empty if there is none."""
     try:
         stat = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
     except (FileNotFoundError, ProcessLookupError):
@@ -194,7 +195,7 @@ def cores_kept_awake() -> Iterator[str]:
             stack.enter_context(LATENCY_REQUEST.open("r+b", 0)).write(bytes(4))
         except OSError as error:
             refusal = (
-                f"idle cores sleep, since {LATENCY_REQUEST} cannot be opened: {error.strerror}"
+                f"idle cores sleep, because {LATENCY_REQUEST} cannot be opened: {error.strerror}"
             )
         yield refusal
 

@@ -73,6 +73,7 @@ def check_regular_file(path: Path, limit_bytes: int) -> None:
 
 
 def _check(path: Path, status: os.stat_result, limit_bytes: int) -> None:
+    """Raise `RefusedFileError` unless a status describes a regular file within the limit."""
     if not stat.S_ISREG(status.st_mode):
         kind = _KINDS[stat.S_IFMT(status.st_mode)]
         raise RefusedFileError(errno.EINVAL, f"not a regular file, but a {kind}", str(path))
@@ -80,6 +81,7 @@ def _check(path: Path, status: os.stat_result, limit_bytes: int) -> None:
 
 
 def _check_size(path: Path, size: int, limit_bytes: int) -> None:
+    """Raise `RefusedFileError` if a file is larger than the limit."""
     if size > limit_bytes:
         reason = f"too large: {size} bytes; the limit is {limit_bytes}"
         raise RefusedFileError(errno.EFBIG, reason, str(path))

@@ -57,7 +57,7 @@ class Ring:
             DamageError: The number is impossible.
         """
         if not 0 <= (count := self._head[0]) < MOST:
-            raise DamageError(f"a ring of {count} records")
+            raise DamageError(f"a ring cannot have {count} records")
         return count
 
     def resume(self, taken: int) -> None:

@@ -142,10 +142,10 @@ class Segment:
             here = f"rack '{layout.rack}': the processor here is {machine}"
             if sys.maxsize < 1 << 32:
                 raise SegmentError(f"{here}, without atomic access to 64 bits")
-            why = f"the backplane's memory order is argued for {PROCESSOR} alone"
+            why = f"the backplane's memory order is proved for {PROCESSOR} alone"
             if not os.environ.get(TRY):
-                raise SegmentError(f"{here}; {why}; {TRY}=1 tries it all the same")
-            sys.stderr.write(f"{here}; {why}: nobody has tested this\n")
+                raise SegmentError(f"{here}; {why}; set {TRY}=1 to try it")
+            sys.stderr.write(f"{here}; {why}, and this one is untested\n")
         texts = [encode_json(asdict(layout)).encode(), config.encode(), published.encode()]
         places = AddressMap(layout)
         size = pages(places.size + sum(len(t) for t in texts))
@@ -185,8 +185,8 @@ class Segment:
                 for count in (file_system.f_blocks, file_system.f_bavail)
             )
             space_text = (
-                f"{SHM_FOLDER} has {whole} bytes, {free} of them free; in a container --shm-size"
-                " enlarges it"
+                f"{SHM_FOLDER} has {whole} bytes, {free} of them free; for a container, --shm-size"
+                " sets its size"
             )
             raise SegmentError(
                 f"rack '{layout.rack}': {size} bytes of shared memory: {error.strerror}:"
@@ -195,6 +195,7 @@ class Segment:
         return segment
 
     def _fill_head(self, texts: list[bytes]) -> None:
+        """Fill the head, the texts and the initial words of a new segment."""
         address = self.map.size
         self.words[Head.CHECK] = crc32(b"".join(texts))
         for at, text in zip(TEXTS, texts, strict=True):
@@ -282,7 +283,7 @@ class Segment:
             )
         if self.words[Head.SIZE] != len(self.bytes):
             raise SegmentError(
-                f"rack '{self.rack}': {len(self.bytes)} bytes; its head says"
+                f"rack '{self.rack}': the segment has {len(self.bytes)} bytes, but its head says"
                 f" {self.words[Head.SIZE]}"
             )
         try:
@@ -294,10 +295,10 @@ class Segment:
             self.layout = layout_of(json.loads(layout))
             self.map = AddressMap(self.layout)
             if self.map.size != self.words[Head.LAYOUT_AT]:
-                raise ValueError(f"a layout of {self.map.size} bytes")
+                raise ValueError(f"the layout cannot have {self.map.size} bytes")
         except (TypeError, LookupError, ValueError, AttributeError, RecursionError) as error:
             raise SegmentError(
-                f"rack '{self.rack}': layout unreadable, damaged or from another program: {error}"
+                f"rack '{self.rack}': the layout is damaged or from another program: {error}"
             ) from None
 
     def view(self, address: int, size: int) -> memoryview:
@@ -448,10 +449,12 @@ def shm_path(rack: str) -> Path:
 
 
 def _pid_namespace() -> int:
+    """Return the inode of this process's PID namespace."""
     return Path("/proc/self/ns/pid").stat().st_ino
 
 
 def _shm_name(rack: str) -> str:
+    """Return the name under which `posix_ipc` knows the segment of a rack."""
     return f"/{PREFIX}{rack}"
 
 
@@ -465,6 +468,7 @@ def layout_of(plain: dict[str, Any]) -> Layout:
 
 
 def _restored(kind: Any, plain: Any) -> Any:
+    """Convert plain data to an instance of a dataclass or to a tuple, recursively."""
     if isinstance(plain, list):
         inner, *_ = get_args(kind)
         return tuple([_restored(inner, entry) for entry in plain])
@@ -478,4 +482,5 @@ def _restored(kind: Any, plain: Any) -> Any:
 
 @cache
 def _types_of(record: type) -> dict[str, Any]:
+    """Return the types of a dataclass's fields."""
     return get_type_hints(record)

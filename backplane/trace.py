@@ -130,7 +130,9 @@ class CycleRecord:
         return None
 
     def _keeps(self, number: int) -> bool:
+        """Check whether the record with this number cannot be partly overwritten."""
         return number >= oldest_kept(self._block[Block.TRACE_HEAD], self._depth)
 
     def _at(self, number: int) -> int:
+        """Return the index of the first word of the record with this number."""
         return self._first + number % self._depth * _RECORD

@@ -246,6 +246,7 @@ class Journal:
 
     @property
     def _tick(self) -> int:
+        """Current tick, -1 before the run."""
         if self.segment is None or self.segment.words[System.STATE] == Run.STARTING:
             return -1
         return self.segment.words[System.TICK]
@@ -345,13 +346,13 @@ class Ending:
             lasted_ms = ran_ms - block[Block.LEVEL_SINCE] * tick_ms
             if block[Block.LEVEL_STATE] == State.HOLDING and lasted_ms > HELD_MS:
                 held.append(
-                    f"level '{name}' held for {lasted_ms:g} ms without a cause in sight:"
+                    f"level '{name}' held for {lasted_ms:g} ms without a known cause:"
                     f" {reason_of(status) or 'no reason given'}"
                 )
         counted = [braking for braking in found if braking.why != DEMANDED] or unreleased
         times = [braking.lasted_ms for braking in counted]
         if max(times, default=0.0) > HELD_MS or sum(times) > HELD_PART * ran_ms:
-            yield f"held without a cause in sight, in {ran_ms:g} ms: {braked_text(counted)}"
+            yield f"held without a known cause, in {ran_ms:g} ms: {braked_text(counted)}"
         elif not any(box.name.startswith("lan.") for box in segment.layout.mailboxes):
             yield from held
 

@@ -33,7 +33,7 @@ def _mailbox(entry: RequestEntry, layout: Layout) -> MailboxSpec:
     """
     mailbox = pick(layout.mailboxes, entry.mailbox, "mailbox")
     if mailbox.message != OperatorCommand.message_type.name:
-        raise DamageError(f"a command for '{mailbox.name}'")
+        raise DamageError(f"mailbox '{mailbox.name}' does not take operators' commands")
     return mailbox
 
 
@@ -65,4 +65,5 @@ def describe(message: OperatorCommand) -> str:
 
 
 def _numbers(values: np.ndarray) -> str:
+    """Format numbers for a command line."""
     return ", ".join(f"{value:g}" for value in values.tolist())

@@ -34,7 +34,7 @@ It covers the clock's wake-up and its work in a tick.
 LATE_PART = 2
 """Divisor of the tick that gives the delay from which a core counts as taken away.
 
-The delay is that of the clock's wake-up, or the time in which nothing runs although tasks are due.
+It applies to the clock's wake-up, and to time in which nothing runs although tasks are due.
 """
 LEAD_PART = 3
 """Divisor of the tick that limits the time by which the clock is ahead."""
@@ -253,10 +253,12 @@ class RealtimeDriver(ClockDriver):
         self.check(due, tick)
 
     def _time_of(self, tick: int) -> int:
+        """Return the grid point of a tick, in ns of CLOCK_MONOTONIC."""
         return self._epoch_ns + tick * self._period_ns
 
     def _sleep_until(self, time_ns: int) -> None:
         # Repeat the wait, because rounding may end it slightly early.
+        """Sleep until a time, in ns of CLOCK_MONOTONIC."""
         while (wait := time_ns - time.monotonic_ns()) > 0:
             time.sleep(wait * 1e-9)
 

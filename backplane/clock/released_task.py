@@ -186,6 +186,7 @@ class Watchdog:
             self._alarms.ring(tick, Alarm.STARVED, task.index, missed, tick - missed * spec.every)
 
     def _hangs(self, task: ReleasedTask) -> bool:
+        """Check whether a task that has missed several releases is proved to hang."""
         spec = task.spec
         pid = task.block[Block.PID]
         state = state_of(pid)

@@ -171,12 +171,14 @@ class NextCycle:
     def _await_post(self) -> bool:
         # The bound may stem from an earlier wait. A timeout that comes early only costs one extra
         # check.
+        """Wait for the semaphore in lockstep. Returns False if the launcher has ended."""
         if not self._semaphore.wait():
             return True
         self._semaphore.bind(monotonic_ns() + int(CHECK_S * 1e9))
         return self._look_around()
 
     def _block_on_semaphore(self) -> bool:
+        """Wait for the semaphore in real time. Returns False if the launcher has ended."""
         bound = int(CHECK_S * 1e9)
         if self._silent_clock is not None and self._has_begun:
             bound = min(bound, self._silent_clock.patience_ns(self._due))
@@ -184,6 +186,7 @@ class NextCycle:
         return not self._semaphore.wait() or self._look_around()
 
     def _spin(self) -> bool:
+        """Poll for the release. Returns False if the launcher has ended."""
         block = self._block
         due = self._due
         for _ in range(SPINS):

@@ -102,6 +102,7 @@ class HostReader:
         return None
 
     def _fetched(self, serial: int) -> AnyMessage | None:
+        """Return the message of a serial. A bad one is counted as refused and gives None."""
         slots = self._slots
         if (
             slots.fetch(serial)
@@ -122,6 +123,7 @@ def is_proper(record: np.ndarray | np.void, fields: Sequence[FieldSpec]) -> bool
 
 
 def _is_permitted(values: np.ndarray, field: FieldSpec) -> bool:
+    """Check the values of one field, which may have any shape."""
     kind = values.dtype.kind
     if kind == "f" and not np.isfinite(values).all():
         return False
@@ -136,6 +138,7 @@ def _is_permitted(values: np.ndarray, field: FieldSpec) -> bool:
 
 
 def _has_length(values: np.ndarray, limits: tuple[float, float], is_vector: bool) -> bool:
+    """Check the length of vectors along the last axis, or the magnitude of numbers."""
     sizes = np.abs(values)
     if is_vector:
         # Never overflows, unlike a sum of squares.

@@ -111,6 +111,7 @@ def burst_of(sources: Sequence[InterruptSource]) -> Burst:
 
 
 def _arrivals(source: InterruptSource) -> Iterator[tuple[int, int]]:
+    """Yield the arrivals of a source from time 0 on, each with its service time, in ns."""
     at_ns = 0
     while True:
         yield at_ns, source.service_ns

@@ -189,6 +189,7 @@ class BoardInbox:
 
     def _arrive(self, at_ns: int, line: InterruptLine, serial: int) -> None:
         # A late message cannot be inserted before messages that have already been served.
+        """Add the arrival of a message to the inbox, or count the message as lost."""
         self._newest_ns = max(self._newest_ns, at_ns)
         end_ns = self.inbox.arrive(self._newest_ns, line.service_ns)
         if end_ns is None:

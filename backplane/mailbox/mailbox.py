@@ -349,10 +349,12 @@ class Reader:
             self._count_forged()
 
     def _count_forged(self) -> None:
+        """Count the message fetched last as forged, and record the process that it names."""
         self.statistics.forged += 1
         self.statistics.forger = pid_of(self.slots.signature)
 
     def _cut_off(self) -> Reading[AnyMessage]:
+        """Count a read that timed out, and return the last good message with BUS_ERROR."""
         self.statistics.bus_errors += 1
         self.statistics.bad_reads += 1
         verdict = Verdict.BUS_ERROR if self.serial else Verdict.NONE

@@ -85,6 +85,7 @@ def message_dtype(fields: tuple[FieldSpec, ...], size: int) -> np.dtype:
 
 
 def _format(field: FieldSpec) -> tuple[str | np.dtype, tuple[int, ...]]:
+    """Return the numpy type and the shape of one field."""
     if not field.fields:
         return field.kind, field.shape
     # The kind of a group, "V<bytes>", contains its size.

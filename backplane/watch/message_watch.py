@@ -154,6 +154,7 @@ class MessageWatch:
         self.newest = max(released, self.newest)
 
     def _find(self, code: Alarm, tick: int, value: float = 0.0, since: int | None = None) -> None:
+        """Record a finding of the current read."""
         self._episodes.find(code, self._reader.accesses, tick, value, since)
 
 

@@ -63,6 +63,7 @@ def _changed(now: Any, built: Any) -> Any:
 
 
 def _present(items: Iterable[tuple[str, Any]]) -> dict[str, Any]:
+    """Return the items as a dictionary, without omitted values."""
     return {name: value for name, value in items if value is not _NOTHING}
 
 
@@ -81,6 +82,7 @@ class _Reading:
         return ObjectAttributes(_present(plain))
 
     def _plain(self, thing: Any, depth: int) -> Any:
+        """Return a value as plain data, or `_NOTHING` if it is not shown."""
         match thing:
             case Enum():
                 return thing.name.lower()
@@ -114,6 +116,7 @@ class _Reading:
         return {name: self._array(array[name], depth) for name in array.dtype.names}
 
     def _items(self, thing: Any, depth: int) -> Any:
+        """Return a collection as plain data, or its size if it is too large."""
         if len(thing) > MOST:
             return f"{len(thing)} items"
         if isinstance(thing, Mapping):

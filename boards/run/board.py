@@ -88,7 +88,7 @@ def _describe_failure(segment: Segment, name: str, error: Exception) -> str:
         block[Block.FAILED] = place * REPEATS + repeats
         if repeats:
             reason = "".join(traceback.format_exception_only(error)).rstrip()
-            return f"board '{name}' failed in the same place, {repeats} more so far: {reason}"
+            return f"board '{name}' failed again in the same place ({repeats} repeats): {reason}"
     return f"board '{name}' failed:\n{traceback.format_exc().rstrip()}"
 
 
@@ -118,6 +118,7 @@ def run_task_board(segment: Segment, wiring: TaskWiring, attention: int, copies:
 
 
 def _run_level(segment: Segment, wiring: TaskWiring, attention: int, copies: socket) -> None:
+    """Build and test the level of a task, then run its cycles."""
     spec = segment.layout.task(wiring.task)
     copier = Copier(segment, wiring.task, copies) if takes_snapshots(segment) else None
     block = segment.block(wiring.task)

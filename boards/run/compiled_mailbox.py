@@ -23,6 +23,7 @@ from rack.levels.compiled import compiled, compiled_for
 
 
 def _words(*names: str) -> np.dtype:
+    """Build a numpy dtype of 64-bit words."""
     return np.dtype([(name, "i8") for name in names])
 
 

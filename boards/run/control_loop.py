@@ -110,6 +110,7 @@ class VirtualControlLoop(Task):
             self._report(tick)
 
     def _report(self, tick: int) -> None:
+        """Raise alarms for the level's findings, and update the faults that act in the cycle."""
         executor = self.executor
         for finding in executor.findings:
             # A level may raise user-defined findings in every cycle. Raise one alarm per episode.

@@ -128,7 +128,7 @@ class Copier:
             try:
                 pid = os.fork()
             except OSError as error:
-                raise SnapshotError(f"{self._name}: no copy: {error.strerror}") from None
+                raise SnapshotError(f"{self._name}: cannot be copied: {error.strerror}") from None
             if pid:
                 CopyNote(tick, self._name, pid).send(self._line, here.fileno(), *memory)
                 # Reap the copies that have ended, which are children of this process.
@@ -205,7 +205,7 @@ class Copier:
         ]
         threads = [path for path in _THREADS.iterdir() if path.name != str(os.getpid())]
         return resources + [
-            f"it has the thread {(path / 'comm').read_text().strip()}" for path in threads
+            f"it runs the thread {(path / 'comm').read_text().strip()}" for path in threads
         ]
 
 

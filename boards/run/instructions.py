@@ -55,6 +55,7 @@ class instruction(compiled[..., Any]):  # noqa: N801  # a decorator
 
 
 def _pointer(builder: Any, address: Any) -> Any:
+    """Emit the conversion of an address to a pointer to a word."""
     from llvmlite import ir
 
     return builder.inttoptr(address, ir.IntType(64).as_pointer())

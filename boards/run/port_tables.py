@@ -106,6 +106,7 @@ def can_read(line: Line) -> bool:
 
 
 def _conclude(line: Line, result: int, tick: int) -> Reading[AnyMessage]:
+    """Return the reading of a port from its compiled result, with Python's judgement."""
     watched = line.watched
     if result & SLOW:
         return line.read(tick)
@@ -125,7 +126,7 @@ def address_of(memory: memoryview) -> int:
     address = int(np.frombuffer(memory, np.uint8).ctypes.data)
     if address % WORD:
         raise MailboxError(
-            f"memory at {address:#x} is not aligned to {WORD} bytes: atomic access needs that"
+            f"memory at {address:#x} is not aligned to {WORD} bytes, as atomic access requires"
         )
     return address
 

@@ -191,6 +191,7 @@ class OutputPort:
         self._held_up = self._refused = 0
 
     def _send(self, basis: int | None = None) -> bool:
+        """Mark the message of a port on demand to be written in this cycle."""
         self._is_sent = True
         self._basis = basis
         return True

@@ -149,4 +149,5 @@ class ClockCopies:
 
 
 def _is_copied(block: memoryview) -> bool:
+    """Check whether a task has forked its copy or refused to."""
     return block[Block.COPY] <= 0

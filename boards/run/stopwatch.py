@@ -144,6 +144,7 @@ class Stopwatch:
         self._closed_ns = monotonic_ns()
 
     def _time_of(self, tick: int) -> int:
+        """Return the time of a tick, in ns of CLOCK_MONOTONIC."""
         return self._release_ns + (tick - self._tick) * self._period_ns
 
     def idle(self) -> None:

@@ -125,6 +125,7 @@ class SystemController:
         self._settled = (*seen, emergency, peer) if is_settled else None
 
     def _handle_loss(self, task: ReleasedTask, tick: int) -> None:
+        """Let a restarted board rejoin, or react to a board that was given up."""
         lockstep = self._wiring.lockstep
         if lockstep and tick < task.lost_tick + self._wiring.restart_ticks:
             return
@@ -202,6 +203,7 @@ class OperatorDesk:
         self.next_tick = min(due, default=sys.maxsize)
 
     def _give(self, entry: RequestEntry, tick: int) -> None:
+        """Issue the command of a waiting request."""
         writer = self._writers[entry.mailbox]
         if not entry.serial:
             # If the clock dies after this line, its successor issues the command again with the

@@ -70,11 +70,11 @@ class Colour(IntEnum):
 @pytest.mark.parametrize(
     ("name", "hint", "declared", "why"),
     [
-        ("raw", float, field(unit="1", doc=""), "permitted: annotated"),
+        ("raw", float, field(unit="1", doc=""), "must be annotated"),
         ("copy_from", float, field(unit="1", doc=""), "no attribute of Message"),
         ("_x", float, field(unit="1", doc=""), "no leading '_'"),
-        ("x", None, field(unit="1", doc=""), "permitted: annotated"),
-        ("x", float, field(doc=""), 'has no unit; of a pure number it is "1"'),
+        ("x", None, field(unit="1", doc=""), "must be annotated"),
+        ("x", float, field(doc=""), 'has no unit; the unit of a pure number is "1"'),
         ("x", float, field("i4", unit="1", doc=""), "numpy type 'i4' does not hold float"),
         ("x", float, field("f99", unit="1", doc=""), "data type 'f99' not understood"),
         ("x", int, field("u1", unit="1", doc="", default=256), "default 256 does not fit"),

@@ -70,7 +70,7 @@ def test_cores_are_kept_awake_by_a_request_that_is_held(
     monkeypatch.setattr("rack.backplane.process.LATENCY_REQUEST", device)
     with cores_kept_awake() as refusal:
         assert refusal == (
-            f"idle cores sleep, since {device} cannot be opened: No such file or directory"
+            f"idle cores sleep, because {device} cannot be opened: No such file or directory"
         )
     assert not device.exists()
     device.touch()

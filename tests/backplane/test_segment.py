@@ -103,13 +103,13 @@ def rename_field(segment: Segment) -> str:
     start = segment.words[Head.LAYOUT_AT]
     text = bytes(segment.bytes[start : start + segment.words[Head.LAYOUT_SIZE]])
     segment.bytes[start : start + len(text)] = text.replace(b'"wake"', b'"woke"')
-    return "layout unreadable"
+    return "the layout is damaged or from another program"
 
 
 def lengthen(segment: Segment) -> str:
     size = len(segment.bytes)
     os.truncate(shm_path(segment.rack), size + 4096)
-    return f"{size + 4096} bytes; its head says {size}"
+    return f"the segment has {size + 4096} bytes, but its head says {size}"
 
 
 @pytest.mark.parametrize("change", [raise_version, change_kind, rename_field, lengthen])
@@ -152,8 +152,8 @@ def test_a_processor_that_reorders_stores_is_refused_before_anything_is_made(
     monkeypatch.setattr(os, "uname", lambda: SimpleNamespace(machine="aarch64"))
     before = descriptors()
     assert refusal(lambda: Segment.create(layout(rack_name, []), "")) == (
-        f"rack '{rack_name}': the processor here is aarch64; the backplane's memory order is argued"
-        " for x86_64 alone; RACK_TRY_PROCESSOR=1 tries it all the same"
+        f"rack '{rack_name}': the processor here is aarch64; the backplane's memory order is proved"
+        " for x86_64 alone; set RACK_TRY_PROCESSOR=1 to try it"
     )
     assert descriptors() == before
     assert rack_name not in racks()
@@ -167,8 +167,8 @@ def test_another_processor_is_tried_on_demand_if_its_words_have_64_bits(
     Segment.create(layout(rack_name, []), "").close()
     unlink(rack_name)
     assert capsys.readouterr().err == (
-        f"rack '{rack_name}': the processor here is aarch64; the backplane's memory order is argued"
-        " for x86_64 alone: nobody has tested this\n"
+        f"rack '{rack_name}': the processor here is aarch64; the backplane's memory order is proved"
+        " for x86_64 alone, and this one is untested\n"
     )
     monkeypatch.setattr(sys, "maxsize", (1 << 31) - 1)
     assert refusal(lambda: Segment.create(layout(rack_name, []), "")) == (

@@ -46,7 +46,7 @@ def test_a_stall_longer_than_the_patience_is_one_braking_with_its_time(
         assert stall - 4 < braking.lasted_ms < stall - 4 + 6
 
 
-HELD = "held without a cause in sight"
+HELD = "held without a known cause"
 
 
 @pytest.mark.slow

@@ -171,7 +171,7 @@ def test_brakes_hold_a_run_if_they_are_long_or_often_engaged(
     bus: Segment, found: tuple[Braking, ...], is_held: bool
 ) -> None:
     lines = list(ending(bus).held([], found, RAN_MS))
-    text = f"held without a cause in sight, in {RAN_MS:g} ms: {braked_text(found)}" if found else ""
+    text = f"held without a known cause, in {RAN_MS:g} ms: {braked_text(found)}" if found else ""
     assert lines == ([text] if is_held else [])
 
 
@@ -203,7 +203,7 @@ def test_a_level_that_holds_for_long_is_named(bus: Segment) -> None:
     block[Block.LEVEL_SINCE] = 400
     assert list(ending(bus).held([], [], 1000.0 + HELD_MS)) == []
     assert list(ending(bus).held([], [], 1000.0 + HELD_MS + 1.0)) == [
-        "level 'upper' held for 5001 ms without a cause in sight: waits for a part"
+        "level 'upper' held for 5001 ms without a known cause: waits for a part"
     ]
     block[Block.LEVEL_STATE] = State.EXECUTING
     assert list(ending(bus).held([], [], 1000.0 + HELD_MS + 1.0)) == []
