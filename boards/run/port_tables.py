@@ -138,8 +138,9 @@ class WriteTable(PortTable):
         """Fill the table.
 
         Args:
-            writers: The writers, for which `can_write` is true, each with the readers on whose
-                messages its message depends.
+            writers: At most `MAX_PORTS` writers, for which `can_write` is true, each with the
+                readers on whose
+            messages its message depends.
         """
         self._writers = [writer for writer, _ in writers]
         self._sources = [

@@ -19,6 +19,7 @@ from rack.backplane.watch.watched_reader import GridReader, watched
 from rack.boards.exchange import Taken
 from rack.boards.faults.kind import kind_of
 from rack.boards.faults.message_steps import FaultyWriter
+from rack.boards.run.compiled_mailbox import MOST_PORTS
 from rack.boards.run.port_tables import Line, ReadTable, WriteTable, can_write
 from rack.boards.wiring import Source
 from rack.levels.level import LevelSection, Reading, Verdict
@@ -298,7 +299,7 @@ class OutputPorts:
             level.place_output(port, output.value)
             if isinstance(writer, QueueWriter):
                 inputs.follow(segment, writer, alarms)
-        self._compiled = [port for port in self._ports if can_write(port.writer)]
+        self._compiled = [port for port in self._ports if can_write(port.writer)][:MOST_PORTS]
         self._table = WriteTable([(port.writer, port.sources) for port in self._compiled])
         self._others = [port for port in self._ports if port not in self._compiled]
         self._is_faulty = False
