@@ -1,4 +1,4 @@
-"""The memory map: windows on pages, nothing over anything else."""
+"""Memory map: windows on pages, without overlaps."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""TOML from outside: what is parsed is TOML's own, and no text takes long to parse."""
+"""TOML from outside: parsed as by the library, and no text takes long to parse."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The fault table: any process fills whole entries, and each task finds its own."""
+"""Fault table: any process fills complete entries, and each task finds its faults."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The utility lines: SYSFAIL by slot, and the lines that one word holds."""
+"""Utility lines: SYSFAIL by slot, and the lines of one word each."""
 
 from __future__ import annotations
 

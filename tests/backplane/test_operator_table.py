@@ -1,5 +1,4 @@
-"""The operator table: requests are filled whole, wait in order, may be withdrawn, and make room
-once issued."""
+"""Operator table: requests are filled completely, wait in order and can be withdrawn."""
 
 from __future__ import annotations
 

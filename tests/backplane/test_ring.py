@@ -1,4 +1,4 @@
-"""Rings read in blocks: nothing lost in time, and an exact count of what was."""
+"""Rings read in blocks: no row is lost while there is time, and lost rows are counted exactly."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The semaphores of a rack: in its segment, for all that attach to it."""
+"""Semaphores of a rack: in its segment, shared by all processes that attach to it."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""Brakes in a run: each time is counted with its reason; a run that they held without a cause in
-sight has failed."""
+"""Engagements of the brakes in a run are counted with their reasons; long ones make it fail."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""The end of a run judged from what is on its backplane: its cause, what held it, where objects
-ended."""
+"""The end of a run, judged from its backplane: its cause, long holds, positions of objects."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ LONG_NS = 20_000_000
 
 @pytest.fixture
 def wake(request: pytest.FixtureRequest) -> Wake:
-    """How the task waits; by signal, unless a test has other wishes."""
+    """How the task waits: by signal, unless the test is parametrized otherwise."""
     return getattr(request, "param", "signal")
 
 

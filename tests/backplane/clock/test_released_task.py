@@ -1,4 +1,4 @@
-"""A task as the clock sees it: what a release writes, when it is finished, lost, and back."""
+"""A task as the clock sees it: released, finished, lost and rejoined."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""A stopped clock, found by a task that waits for it: an alarm needs proof, a late clock gives
-none."""
+"""A stopped clock is found by a waiting task. An alarm needs proof, and a late clock gives none."""
 
 from __future__ import annotations
 

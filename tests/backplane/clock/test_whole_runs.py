@@ -1,5 +1,4 @@
-"""The clock in whole racks in lockstep that lose boards and ticks: what is released, awaited, held,
-lost and taken back stays as it was."""
+"""Clocks of whole racks that lose boards and ticks behave as recorded."""
 
 from __future__ import annotations
 

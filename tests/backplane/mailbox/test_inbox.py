@@ -1,5 +1,4 @@
-"""The arithmetic of an inbox: one served at a time, in order of arrival, as many waiting as
-permitted."""
+"""Timing of an inbox: one message served at a time, in order of arrival, within its bound."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Protocol interrupt on a bus: what a board's reader sees when, and what it never sees."""
+"""Protocol interrupt on a bus: the messages that a board's reader sees, and when."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Board:
         self.restart()
 
     def restart(self) -> None:
-        """Open the reader's end anew, as a restarted task does."""
+        """Open the reader again, as a restarted task does."""
         inbox = open_inbox(self.segment, "reader")
         assert inbox is not None
         self.inbox: BoardInbox = inbox

@@ -35,7 +35,7 @@ def hold(segment: Segment) -> None:
 
 
 def obtains(lock: MailboxLock) -> bool:
-    """Say whether a lock can be obtained within a few of its bounds."""
+    """Check whether a lock can be obtained within a few of its bounds."""
     return any(lock.acquire() for _ in range(3))
 
 

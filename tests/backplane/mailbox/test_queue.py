@@ -1,5 +1,4 @@
-"""Queues: each message once and in order, bounded, visible by ticks, whoever is killed and whatever
-is damaged."""
+"""Queues: each message once and in order, whoever is killed and whatever is damaged."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""Faults of messages on one mailbox, by every protocol and at several rates: what is written, read
-and reported stays as it was."""
+"""Message faults under every protocol and at several rates have their recorded effects."""
 
 from __future__ import annotations
 

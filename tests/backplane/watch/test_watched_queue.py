@@ -1,4 +1,4 @@
-"""A queue that is watched: what of its messages is reported, and when its writer counts as lost."""
+"""A watched queue: faults reported about its messages, and the loss of its writer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Readers that are opened for a task: which kind for which mailbox, and reading on a grid."""
+"""Readers opened for a task: the kind for each mailbox, and reading on a grid."""
 
 from __future__ import annotations
 

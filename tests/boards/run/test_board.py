@@ -1,4 +1,4 @@
-"""A board's process: its name, and what its exit status says of its end."""
+"""A board's process: its name and its exit status."""
 
 from __future__ import annotations
 

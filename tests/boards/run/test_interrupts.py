@@ -1,5 +1,4 @@
-"""Racks whose boards interrupt each other: what arrives, what is lost, what it costs, and that runs
-repeat."""
+"""Racks whose boards interrupt each other: messages lost, processor time, repeated runs."""
 
 from __future__ import annotations
 

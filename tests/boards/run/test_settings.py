@@ -1,4 +1,4 @@
-"""What a level takes over of other settings, and what it keeps."""
+"""Settings that a level takes over, and state that it keeps."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""When the clock takes snapshots: so that they cost a part of lockstep's time, each so many ticks,
-and before a tick that is asked for."""
+"""Times of snapshots: within a share of lockstep's time, periodically, and at a requested tick."""
 
 from __future__ import annotations
 

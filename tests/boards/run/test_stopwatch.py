@@ -1,4 +1,4 @@
-"""The stopwatch of a task: what it traces of a cycle, counts, and reports to the clock."""
+"""The stopwatch of a task: traces, counts, and reports to the clock."""
 
 from __future__ import annotations
 

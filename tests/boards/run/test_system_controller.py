@@ -1,5 +1,4 @@
-"""The system controller at a tick: boards that are lost and come back, and what it then demands of
-the arm."""
+"""The system controller at a tick: lost and restarted boards, and its demand on the arm."""
 
 from __future__ import annotations
 

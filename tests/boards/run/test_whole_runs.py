@@ -1,4 +1,4 @@
-"""Small racks of every kind in lockstep: each leaves what it left before."""
+"""Small racks of every kind in lockstep run as recorded."""
 
 from __future__ import annotations
 
