@@ -147,15 +147,14 @@ class Slots:
     def resume(self, signature: int) -> None:
         """Prepare a writer to continue after the newest published message."""
         # Ignore the sign, so that a flipped sign bit does not make a writer fail.
-        head = whole = self.box[Box.HEAD] & (UNSIGNED >> 1)
-        # A serial may be lost. The chain continues from the newest message that is in its slot.
-        while whole > max(0, head - self.depth) and not self.holds(whole):
-            whole -= 1
-        self.serial = head
+        self.serial = head = self.box[Box.HEAD] & (UNSIGNED >> 1)
         self.signature = signature
-        self.chain = (
-            self.heads[whole & self.mask][_CHECK] & UNSIGNED if whole and self.holds(whole) else 0
-        )
+        # A serial may be lost. The chain continues from the newest message that is in its slot.
+        self.chain = 0
+        for serial in range(head, max(0, head - self.depth - 1), -1):
+            if self.holds(serial):
+                self.chain = self.heads[serial & self.mask][_CHECK] & UNSIGNED
+                break
 
     def clear_unpublished(self) -> None:
         """Empty the slots that a dead writer has filled but not published.

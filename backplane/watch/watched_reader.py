@@ -96,9 +96,7 @@ class WatchedReader(Watched):
         self, segment: Segment, reader: Reader, alarms: AlarmWriter, task: ReadingTask
     ) -> None:
         super().__init__(segment, reader, alarms, task)
-        self._watch = SilenceWatch(segment, reader, self._episodes, task)
-        self.late_from = self._watch.late_from
-        self.quiet = self._watch.quiet
+        self.watch = SilenceWatch(segment, reader, self._episodes, task)
         self.writer = segment.block(reader.spec.writer)
         """Control block of the mailbox's writer."""
         self._lost = {verdict: Reading(reader.message, verdict, True) for verdict in Verdict}
@@ -113,8 +111,8 @@ class WatchedReader(Watched):
         return self.conclude(
             tick,
             reading,
-            is_odd=self._has_trouble or reader.found != self._watch.seen,
-            is_silent=tick - reader.newest >= self.quiet or self.writer[Block.LOST] > 0,
+            is_odd=self._has_trouble or reader.found != self.watch.seen,
+            is_silent=tick - reader.newest >= self.watch.quiet or self.writer[Block.LOST] > 0,
         )
 
     def conclude(
@@ -129,16 +127,16 @@ class WatchedReader(Watched):
             is_silent: True if the writer's silence must be judged.
         """
         if is_odd:
-            self._watch.judge(tick)
+            self.watch.judge(tick)
         if self._has_trouble:
             self._report(tick)
-        if is_silent and self._watch.is_lost(tick):
+        if is_silent and self.watch.is_lost(tick):
             return self._lost[reading.verdict]
         return reading
 
     def is_writer_lost(self, tick: int) -> bool:
         """Check whether the writer is lost, without a read."""
-        return self._watch.is_writer_lost(tick)
+        return self.watch.is_writer_lost(tick)
 
 
 class SporadicReader(Watched):

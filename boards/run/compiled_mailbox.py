@@ -18,7 +18,15 @@ import numpy as np
 from rack.backplane.mailbox.mailbox import GOOD, NOT_YET
 from rack.backplane.mailbox.slots import CHECKED_FROM, EPOCH_BITS, SIGNED_FROM, Slots
 from rack.backplane.words import Slot
-from rack.boards.run.instructions import copy, fence, load, record_at, store_release, xxh3
+from rack.boards.run.instructions import (
+    copy,
+    fence,
+    instruction,
+    load,
+    pointer,
+    store_release,
+    xxh3,
+)
 from rack.levels.compiled import compiled, compiled_for
 
 
@@ -34,18 +42,29 @@ STATE = _words("found", "accesses", "transfers", "judged", "judged_tick", *(SLOT
 PORT = _words(
     # Addresses of the mailbox's head, of its first slot, and of the local record of its reader or
     # writer.
-    *("head", "slots", "record"),
+    "head",
+    "slots",
+    "record",
     # Of the slots: distance in bytes, number, and bytes in use.
-    *("stride", "depth", "size"),
+    "stride",
+    "depth",
+    "size",
     # To read: addresses of the reader's state and of the word that marks the writer as lost,
     # whether messages are visible by ticks, and whether compiled code takes and judges them.
-    *("state", "lost", "is_sliced", "is_watched"),
-    *("late_from", "quiet"),  # ticks
+    "state",
+    "lost",
+    "is_sliced",
+    "is_watched",
+    "late_from",
+    "quiet",  # ticks
     # To write: address and length of an array with the addresses of the states of the readers on
     # whose messages the written message depends.
-    *("sources", "source_count"),
+    "sources",
+    "source_count",
     # Period, 0 for a mailbox to read; phase; time until a message is visible. In ticks.
-    *("every", "ahead", "delay"),
+    "every",
+    "ahead",
+    "delay",
     # Result of the last read, or the process of an intruder found by the last write.
     "result",
 )
@@ -62,9 +81,10 @@ MOST_PORTS = 60
 """Maximum number of ports of a table, since each has a bit in the result of a call."""
 
 
-port_at = record_at(PORT)
-state_at = record_at(STATE)
-slot_at = record_at(SLOT)
+# Functions that give compiled code the record at an address.
+port_at = instruction(pointer, PORT)
+state_at = instruction(pointer, STATE)
+slot_at = instruction(pointer, SLOT)
 
 
 @compiled

@@ -54,7 +54,7 @@ class instruction(compiled[..., Any]):  # noqa: N801  # a decorator
         return intrinsic(define)
 
 
-def _pointer(builder: Any, address: Any) -> Any:
+def pointer(builder: Any, address: Any) -> Any:
     """Emit the conversion of an address to a pointer to a word."""
     from llvmlite import ir
 
@@ -64,13 +64,13 @@ def _pointer(builder: Any, address: Any) -> Any:
 @instruction
 def load(builder: Any, address: Any) -> Any:
     """Load the word at an address atomically. No later access is moved before it."""
-    return builder.load_atomic(_pointer(builder, address), "acquire", 8)
+    return builder.load_atomic(pointer(builder, address), "acquire", 8)
 
 
 @instruction
 def store_release(builder: Any, address: Any, value: Any) -> None:
     """Store a word at an address atomically. No earlier access is moved after it."""
-    builder.store_atomic(value, _pointer(builder, address), "release", 8)
+    builder.store_atomic(value, pointer(builder, address), "release", 8)
 
 
 @instruction
@@ -84,13 +84,8 @@ def copy(builder: Any, target: Any, source: Any, size: Any) -> None:
     """Copy `size` bytes from the address `source` to the address `target`."""
     from numba.core.cgutils import raw_memcpy
 
-    ends = _pointer(builder, target), _pointer(builder, source)
+    ends = pointer(builder, target), pointer(builder, source)
     raw_memcpy(builder, *ends, size, 1)  # type: ignore[no-untyped-call]
-
-
-def record_at(dtype: np.dtype) -> instruction:
-    """Return a function that gives compiled code the record of type `dtype` at an address."""
-    return instruction(_pointer, dtype)
 
 
 xxh3 = c_function(_xxhash.__file__, "XXH3_64bits_withSeed", 3)

@@ -84,17 +84,28 @@ class ReadTable(PortTable):
             if isinstance(watched, WatchedReader):
                 port["is_watched"] = True
                 port["lost"] = address_of(watched.writer[Block.LOST : Block.LOST + 1])
-                port["late_from"] = watched.late_from
-                port["quiet"] = watched.quiet
+                port["late_from"] = watched.watch.late_from
+                port["quiet"] = watched.watch.quiet
 
     def read(self, tick: int) -> None:
         """Read every mailbox as of `tick`."""
         touched = self._access(tick, 0)
         if touched:
             for at, line in enumerate(self._lines):
-                if touched >> at & 1:
-                    result = int(self._ports["result"][at])
-                    line.values[line.key] = _conclude(line, result, tick)
+                if not touched >> at & 1:
+                    continue
+                result = int(self._ports["result"][at])
+                watched = line.watched
+                if result & SLOW:
+                    reading = line.read(tick)
+                else:
+                    reading = watched.reader.reading(bool(result & NEW))
+                    if isinstance(watched, WatchedReader):
+                        is_odd, is_silent = bool(result & ODD), bool(result & SILENT)
+                        reading = watched.conclude(
+                            tick, reading, is_odd=is_odd, is_silent=is_silent
+                        )
+                line.values[line.key] = reading
         for line in self._others:
             line.values[line.key] = line.read(tick)
 
@@ -103,18 +114,6 @@ def can_read(line: Line) -> bool:
     """Check whether compiled code can read a mailbox: at every tick, without a lock."""
     watched = line.watched
     return line.read == watched.read and type(watched.reader) in (Reader, DoubleBufferReader)
-
-
-def _conclude(line: Line, result: int, tick: int) -> Reading[AnyMessage]:
-    """Return the reading of a port from its compiled result, with Python's judgement."""
-    watched = line.watched
-    if result & SLOW:
-        return line.read(tick)
-    reading = watched.reader.reading(bool(result & NEW))
-    if isinstance(watched, WatchedReader):
-        is_odd, is_silent = bool(result & ODD), bool(result & SILENT)
-        reading = watched.conclude(tick, reading, is_odd=is_odd, is_silent=is_silent)
-    return reading
 
 
 def address_of(memory: memoryview) -> int:

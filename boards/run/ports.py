@@ -185,7 +185,6 @@ class OutputPort:
         # A message that is not written in every cycle becomes visible at multiples of its period,
         # counted from its phase.
         self._ahead = spec.ahead - spec.phase
-        self._every = spec.every
         self._index = segment.layout.index(spec.name)
         self._episodes = Episodes(segment, spec.name, alarms)
         self._faulty: FaultyWriter | None = None
@@ -224,7 +223,7 @@ class OutputPort:
         if self._faulty is not None and self._faulty.is_over:
             self._faulty = None
         in_time = True
-        if (tick + self._ahead) % self._every or not self._is_sent:
+        if (tick + self._ahead) % writer.spec.every or not self._is_sent:
             self.flush(tick, now)
         else:
             basis = min([source.basis for source in self.sources if source.serial], default=tick)

@@ -71,8 +71,8 @@ class Colour(IntEnum):
     ("name", "hint", "declared", "why"),
     [
         ("raw", float, field(unit="1", doc=""), "must be annotated"),
-        ("copy_from", float, field(unit="1", doc=""), "no attribute of Message"),
-        ("_x", float, field(unit="1", doc=""), "no leading '_'"),
+        ("copy_from", float, field(unit="1", doc=""), "not named like an attribute"),
+        ("_x", float, field(unit="1", doc=""), "without leading '_'"),
         ("x", None, field(unit="1", doc=""), "must be annotated"),
         ("x", float, field(doc=""), 'has no unit; the unit of a pure number is "1"'),
         ("x", float, field("i4", unit="1", doc=""), "numpy type 'i4' does not hold float"),
