@@ -1,25 +1,24 @@
-"""The backplane: one shared-memory segment per rack, with its mailboxes, its clock, and the watches
-on them.
+"""The backplane: one shared-memory segment per rack, with mailboxes, a clock and watches.
 
 A level's author needs `Message`, `Command`, `Status` and `field` to declare messages, `State` for
-their statuses, and `Reading` with its `Verdict` for input ports. A program that looks into a
-running rack needs the rest:
+their statuses, and `Reading` with its `Verdict` for input ports. A program that inspects a running
+rack needs the other names:
 
     from rack.backplane import Segment, open_observer
 
     segment = Segment.attach("nasrem")
     print(open_observer(segment, "servo.status").peek().message)
 
-- `Segment` is a rack's memory, `Layout` its mailboxes and tasks as plain data (`MailboxSpec`,
-  `TaskSpec`).
-- `open_writer` and `open_reader` open a mailbox under its protocol; `open_observer` never takes its
+- `Segment` is a rack's memory. `Layout` describes its mailboxes and tasks as plain data
+  (`MailboxSpec`, `TaskSpec`).
+- `open_writer` and `open_reader` open a mailbox under its protocol. `open_observer` never takes its
   lock.
-- `SystemClock` reads the clock; `Alarm` lists the kinds of alarms; `Demand` is the demand of safety
-  on the arm.
+- `SystemClock` reads the clock, `Alarm` lists the kinds of alarms, and `Demand` is what the safety
+  functions demand of the arm.
 - `BackplaneError` is the root of all errors of this package.
 
-Names are imported on first use: numpy takes a tenth of a second, which `rack list` and the like
-need not wait for.
+Names are imported on first use, because importing numpy takes a tenth of a second, which commands
+such as `rack list` need not wait for.
 """
 
 from __future__ import annotations

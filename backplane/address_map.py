@@ -1,8 +1,8 @@
-"""The memory map: the bus address of every board's window, task block and mailbox.
+"""Memory map with the bus address of every board's window, task block and mailbox.
 
 Addresses are byte offsets in the segment. A board's window starts on a page and holds the control
-blocks, trace rings and alarm rings of its tasks, then the mailboxes that it writes. The map follows
-from the layout alone.
+blocks, trace rings and alarm rings of its tasks, followed by the mailboxes that it writes. The
+layout alone determines the map.
 """
 
 from __future__ import annotations
@@ -13,31 +13,35 @@ from rack.backplane.layout import Layout, MailboxSpec, TaskSpec
 
 PAGE = 4096
 LINE = 64
-"""Bytes of a cache line: blocks of two writers never share one."""
+"""Bytes of a cache line. Blocks of two writers never share one."""
 
 HEAD_SIZE = PAGE
 BLOCK_SIZE = 256
 TRACE_RECORD_SIZE = 88
 ALARM_RECORD_SIZE = 192
 ALARM_DEPTH = 256
-"""Records in an alarm ring: it is read many times a second, and an alarm is raised once per
-episode."""
+"""Number of records in an alarm ring.
+
+The ring is read many times a second, and an alarm is raised once per episode.
+"""
 FAULT_ENTRY_SIZE = 256
 FAULT_ENTRIES = 64
 OPERATOR_HEAD_SIZE = LINE
 OPERATOR_ENTRIES = 128
 CLOCK = "clock"
-"""The system controller, in slot 1: its window holds the fault table, the operator table and
-operators' mailboxes."""
+"""Name of the system controller, in slot 1.
+
+Its window holds the fault table, the operator table and the operators' mailboxes.
+"""
 MAILBOX_HEAD_SIZE = 2 * LINE
 SLOT_HEAD_SIZE = 64
 ALARM_SIZE = LINE + ALARM_DEPTH * ALARM_RECORD_SIZE
-"""Bytes of one alarm ring: a line for its head, then the records."""
+"""Bytes of one alarm ring: a cache line for its head, followed by the records."""
 
 
 @dataclass(frozen=True)
 class Window:
-    """A board's part of the segment: `address` and `size` in bytes."""
+    """Part of the segment that belongs to one board, with its address and size in bytes."""
 
     board: str
     address: int
@@ -45,8 +49,10 @@ class Window:
 
 
 class AddressMap:
-    """Addresses of everything on one backplane; `size` is their total in bytes, without the
-    texts.
+    """Bus addresses of everything on one backplane.
+
+    Attributes:
+        size: Total size in bytes, without the texts that follow in the segment.
     """
 
     def __init__(self, layout: Layout) -> None:
@@ -80,7 +86,7 @@ class AddressMap:
         return address
 
     def _end_window(self, board: str, writers: set[str], layout: Layout) -> None:
-        """Place the mailboxes of the tasks of a board, and end its window with a whole page."""
+        """Place the mailboxes of a board's tasks and pad its window to a whole page."""
         for mailbox in layout.mailboxes:
             if mailbox.writer in writers:
                 self.mailboxes[mailbox.name] = self._take(mailbox_size(mailbox))
@@ -95,39 +101,37 @@ def pages(size: int) -> int:
 
 
 def trace_size(task: TaskSpec) -> int:
-    """Return the bytes of a task's trace ring."""
+    """Return the size of a task's trace ring, in bytes."""
     return task.depth * TRACE_RECORD_SIZE
 
 
 def slot_stride(mailbox: MailboxSpec) -> int:
-    """Return the bytes from one slot of a mailbox to the next."""
+    """Return the distance from one slot of a mailbox to the next, in bytes."""
     return _up(SLOT_HEAD_SIZE + mailbox.size, LINE)
 
 
 def mailbox_size(mailbox: MailboxSpec) -> int:
-    """Return the bytes of a mailbox: its head and its slots."""
+    """Return the size of a mailbox with its head and its slots, in bytes."""
     return MAILBOX_HEAD_SIZE + mailbox.depth * slot_stride(mailbox)
 
 
 def oldest_kept(head: int, depth: int) -> int:
-    """Return the number of the oldest record in a ring that its writer cannot have begun to
-    overwrite.
+    """Return the number of the oldest record in a ring that cannot be partly overwritten.
 
-    The writer is at most one record ahead of its `head`. A concurrent reader copies first, then
-    compares with the present head: a copy of an older record may be half overwritten, and proves
-    nothing.
+    The writer is at most one record ahead of its `head`. A concurrent reader copies a record first
+    and compares its number with the result for the current head afterwards. The copy of an older
+    record may be half overwritten and proves nothing.
     """
     return head + 2 - depth
 
 
 def operator_entry_size(layout: Layout) -> int:
-    """Return the bytes of one entry of the operator table: its head, and room for the largest of
-    its messages.
-    """
+    """Return the size of an operator table entry with room for the largest message, in bytes."""
     return OPERATOR_HEAD_SIZE + _up(
         max((m.size for m in layout.mailboxes if m.writer == CLOCK), default=0), LINE
     )
 
 
 def _up(value: int, step: int) -> int:
+    """Round `value` up to a multiple of `step`."""
     return -(-value // step) * step

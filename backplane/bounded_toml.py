@@ -1,6 +1,4 @@
-"""TOML text from outside, parsed within bounds: the time of a parse grows with the length of the
-text alone.
-"""
+"""Parser for TOML text from outside, in time proportional to the length of the text."""
 
 from __future__ import annotations
 
@@ -9,12 +7,12 @@ import tomllib
 from typing import Any
 
 MAX_DEPTH = 32
-"""Limit on the parts of a key, on the nesting of tables and lists, and on chains of `extends`."""
+"""Maximum number of parts of a key, nested tables or lists, and chained `extends`."""
 INTEGER_BITS = 64
-"""TOML's own limit; Python's integers have none."""
-TOO_DEEP = f"nested too deeply; permitted: {MAX_DEPTH} levels"
-TOO_LONG = f"integer too long; permitted: {INTEGER_BITS} bits"
-# A string that does not end is matched too, so that the text is read once, whatever is in it.
+"""Size of a TOML integer. Python's own integers have no limit."""
+TOO_DEEP = f"nested too deeply: the limit is {MAX_DEPTH} levels"
+TOO_LONG = f"integer too long: the limit is {INTEGER_BITS} bits"
+# An unterminated string matches too, so any text is scanned only once.
 _QUOTED = re.compile(
     r'"""(?:[^"\\]++|\\.|"{1,2}(?!"))*+"{0,5}'
     r"|'''(?:[^']++|'{1,2}(?!'))*+'{0,5}"
@@ -27,17 +25,17 @@ _KEYS = re.compile(r"[\w\-. \t]++")
 
 
 def load_toml(text: str) -> dict[str, Any]:
-    """Return the tables of TOML text.
+    """Parse TOML text into tables.
 
-    The depth of tables and lists and the length of integers are bounded by Python alone:
-    `rack.boards.config.toml.parse` bounds them as a config needs it.
+    Only Python itself limits the depth of tables and lists and the length of integers.
+    `rack.boards.config.toml.parse` applies the limits of a config.
 
     Raises:
         tomllib.TOMLDecodeError: The text is not TOML.
-        ValueError: A key has more than `MAX_DEPTH` parts, tables or lists are nested more deeply
-            than Python can parse, or an integer has thousands of digits.
+        ValueError: A key has more than `MAX_DEPTH` parts, tables or lists are nested more
+            deeply than Python can parse, or an integer has thousands of digits.
     """
-    # The parser's time grows with the square of the parts of a key.
+    # The time that the parser takes grows with the square of the number of parts of a key.
     keys = _KEYS.findall(_QUOTED.sub("q", text))
     if any(key.count(".") >= MAX_DEPTH for key in keys):
         raise ValueError(TOO_DEEP)

@@ -1,10 +1,10 @@
-"""An exclusive, non-blocking kernel lock on one byte of a segment.
+"""Exclusive, non-blocking kernel lock on one byte of a segment.
 
 Each lock has its own file description, so two holders in one process exclude each other too. The
-kernel releases it when the process ends, even if it is killed.
+kernel releases the lock when the process ends, even if it is killed.
 
 Alternative considered: record locks of a process, which a fork does not inherit. The kernel would
-release them as soon as their process closes any other descriptor of the same file.
+release them as soon as the process closes any other descriptor of the same file.
 """
 
 from __future__ import annotations
@@ -19,12 +19,14 @@ from weakref import WeakSet
 _HELD: set[ProcessLock] = set()
 _OPEN: WeakSet[ByteLock] = WeakSet()
 _FLOCK = struct.Struct("hhqqi4x")
-"""`struct flock` of 64-bit Linux: type, whence, start, length, pid (0: locks of a file description
-have none)."""
+"""Fields of `struct flock` on 64-bit Linux: type, whence, start, length and pid.
+
+The pid is 0 for a lock that belongs to a file description.
+"""
 
 
 class ByteLock:
-    """The lock on the byte at a bus address of an open segment."""
+    """Lock on the byte at a bus address of an open segment."""
 
     def __init__(self, fd: int, address: int) -> None:
         self.reopen(fd)
@@ -33,11 +35,11 @@ class ByteLock:
         self._unlock = _one_byte(fcntl.F_UNLCK, address)
 
     def reopen(self, fd: int) -> None:
-        """Use another segment, open as `fd`; the lock is not taken there."""
+        """Switch to another segment, open as `fd`. The lock is not taken in the new segment."""
         self._fd = os.open(f"/proc/self/fd/{fd}", os.O_RDWR | os.O_CLOEXEC)
 
     def take(self) -> bool:
-        """Take the lock; False when it is held already."""
+        """Take the lock. Returns False if it is already held."""
         try:
             fcntl.fcntl(self._fd, fcntl.F_OFD_SETLK, self._take)
         except (BlockingIOError, PermissionError):
@@ -45,17 +47,18 @@ class ByteLock:
         return True
 
     def release(self) -> None:
-        """Release the lock; it may be taken again."""
+        """Release the lock, so that it can be taken again."""
         fcntl.fcntl(self._fd, fcntl.F_OFD_SETLK, self._unlock)
 
     def close(self) -> None:
-        """Release the lock and its descriptor; may be called again."""
+        """Release the lock and close its descriptor. Repeated calls have no effect."""
         _OPEN.discard(self)
         self.close_file()
 
     def close_file(self) -> None:
-        """Close the descriptor until `reopen`. A process from which this one was forked keeps the
-        lock.
+        """Close the descriptor until `reopen` is called.
+
+        If a parent process forked this one, the parent keeps the lock.
         """
         if self._fd >= 0:
             os.close(self._fd)
@@ -64,8 +67,9 @@ class ByteLock:
 
 @contextmanager
 def locked(fd: int, address: int) -> Iterator[None]:
-    """Hold a lock for a moment, in which an entry of a table is filled; other processes wait for it
-    no longer.
+    """Hold a lock while an entry of a shared table is filled.
+
+    A process that needs the lock at the same time spins until the entry is complete.
     """
     lock = ByteLock(fd, address)
     try:
@@ -77,20 +81,21 @@ def locked(fd: int, address: int) -> Iterator[None]:
 
 
 class ProcessLock(ByteLock):
-    """A lock that ends with the process that made it. Processes that this one forks lose it."""
+    """Lock that ends with the process that created it. Forked children do not inherit it."""
 
     def __init__(self, fd: int, address: int) -> None:
         super().__init__(fd, address)
         _HELD.add(self)
 
     def close(self) -> None:
-        """Release the lock and its descriptor; may be called again."""
+        """Release the lock and close its descriptor. Repeated calls have no effect."""
         _HELD.discard(self)
         super().close()
 
 
 def _close_inherited() -> None:
-    # The parent keeps its lock: it belongs to the file description, which both have open.
+    # The parent keeps its lock, which belongs to the file description that both have open.
+    """Close the locks that a forked child must not keep."""
     for lock in [*_HELD]:
         lock.close()
 
@@ -99,25 +104,24 @@ os.register_at_fork(after_in_child=_close_inherited)
 
 
 def close_all() -> None:
-    """Close the descriptors of all locks of this process, a fork, until `reopen_all`."""
+    """Close the descriptors of all locks of a forked process until `reopen_all` is called."""
     for lock in _OPEN:
         lock.close_file()
 
 
 def reopen_all(fd: int) -> None:
-    """Let all locks be those of another segment, open as `fd`; none is taken there."""
+    """Switch all locks to another segment, open as `fd`, without taking any of them."""
     for lock in _OPEN:
         lock.reopen(fd)
 
 
 def is_locked(fd: int, address: int) -> bool:
-    """Return whether the byte at a bus address of an open segment is locked, without taking the
-    lock.
-    """
+    """Check whether the byte at a bus address is locked, without taking the lock."""
     asked = _one_byte(fcntl.F_RDLCK, address)
     kind: int = _FLOCK.unpack(fcntl.fcntl(fd, fcntl.F_OFD_GETLK, asked))[0]
     return kind != fcntl.F_UNLCK
 
 
 def _one_byte(kind: int, address: int) -> bytes:
+    """Pack a `struct flock` that concerns one byte."""
     return _FLOCK.pack(kind, os.SEEK_SET, address, 1, 0)

@@ -1,6 +1,6 @@
-"""Checks of numbers in shared memory, by those who turn them into names and records.
+"""Checks of numbers from shared memory, before they are used as enum values or indices.
 
-Every process of the user may write there, so that a number may be any.
+Every process of the same user can write to the segment, so a number may have any value.
 """
 
 from __future__ import annotations
@@ -17,7 +17,11 @@ T = TypeVar("T")
 
 
 def as_named(kind: type[E], number: float) -> E:
-    """Return a number as a value of an enum. Raises `DamageError` if it is none."""
+    """Convert a number to a member of an enum.
+
+    Raises:
+        DamageError: No member has this value.
+    """
     whole = as_whole(number)
     if whole not in set(kind):
         raise DamageError(f"{whole} is not a value of {kind.__name__}")
@@ -25,26 +29,27 @@ def as_named(kind: type[E], number: float) -> E:
 
 
 def as_whole(number: float) -> int:
-    """Return a number as an integer. Raises `DamageError` if it is NaN or infinite."""
+    """Convert a number to an integer.
+
+    Raises:
+        DamageError: The number is NaN or infinite.
+    """
     if not isfinite(number):
-        raise DamageError(f"{number} in place of a whole number")
+        raise DamageError(f"{number} is not a whole number")
     return int(number)
 
 
 def pick(items: Sequence[T], index: int, what: str) -> T:
-    """Return the item with an index.
+    """Return the item that an index from shared memory selects.
 
     Args:
         items: The items.
-        index: The number in shared memory.
-        what: Noun for an item, as in "mailbox".
-
-    Returns:
-        The item.
+        index: Index read from shared memory.
+        what: Noun for an item in the error message, such as "mailbox".
 
     Raises:
-        DamageError: There is no such item.
+        DamageError: The index is out of range.
     """
     if not 0 <= index < len(items):
-        raise DamageError(f"{index} is not the number of a {what}; there are {len(items)}")
+        raise DamageError(f"{index} is not the index of a {what}; there are {len(items)}")
     return items[index]

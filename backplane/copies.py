@@ -1,9 +1,8 @@
-"""Copies of a rack's memory: one that is kept, and the change of a process from one segment to
-another.
+"""Copies of a rack's memory, and the switch of a process from one segment to another.
 
-A process has thousands of views of its segment. They stay valid: the memory of another segment is
-mapped at the address of the one before (`mmap` with `MAP_FIXED`). The kernel's locks are of the
-other segment, too: what a process holds, it takes again there.
+A process holds thousands of views of its segment. They stay valid, because the memory of the new
+segment is mapped at the address of the old one (`mmap` with `MAP_FIXED`). The process also takes
+its kernel locks again, in the new segment.
 """
 
 from __future__ import annotations
@@ -41,11 +40,11 @@ OF_LAUNCH = (
     System.SNAPSHOTS,
     System.SNAPSHOT_BYTES,
 )
-"""Words that each launch has of its own."""
+"""System words that belong to one launch and are not restored from a copy."""
 
 
 def copy_memory(segment: Segment) -> int:
-    """Return a file, without a name, with the memory of a segment in which nothing happens."""
+    """Copy the memory of an idle segment to an anonymous file, and return its descriptor."""
     fd = os.memfd_create("snapshot", os.MFD_CLOEXEC)
     written = 0
     while written < segment.map.size:
@@ -54,15 +53,21 @@ def copy_memory(segment: Segment) -> int:
 
 
 def fill_memory(segment: Segment, fd: int, tick: int) -> None:
-    """Fill the segment of a rack that is being launched with a copy, to go on before `tick`.
+    """Restore a copy into the segment of a rack that is being launched.
 
-    No task is there yet. A recorder finds what this rack writes, and nothing before it.
+    The rack continues before `tick`, and none of its tasks may have started yet. A recorder sees
+    only what this rack writes from now on.
+
+    Args:
+        segment: Segment of the new rack.
+        fd: File made by `copy_memory`.
+        tick: First tick that the new rack runs.
     """
     words = segment.words
-    own = [(at, words[at]) for at in OF_LAUNCH]
+    launch_words = [(at, words[at]) for at in OF_LAUNCH]
     start = 8 * System.STATE
     os.preadv(fd, [segment.bytes[start : segment.map.size]], start)
-    for at, value in own:
+    for at, value in launch_words:
         words[at] = value
     words[System.FOLLOWER_TICK] = words[System.FOLLOWER_DRAINED] = tick - 1
     for task in segment.layout.processes:
@@ -72,19 +77,20 @@ def fill_memory(segment: Segment, fd: int, tick: int) -> None:
     for mailbox in segment.layout.mailboxes:
         box = segment.box(mailbox.name)
         box[Box.FIRST] = box[Box.HEAD]
-    # Posts that nobody took mean nothing between two ticks.
+    # Posts that were not taken have no meaning between two ticks.
     segment.initialize_semaphores()
 
 
 def leave(segment: Segment) -> None:
-    """Let go of a segment, in the fork of a process that goes on with it: its memory, its file and
-    its locks. The fork must not use it before `enter`.
+    """Detach a forked process from its segment: release the memory, the file and the locks.
+
+    The process must not use the segment again before it calls `switch_segment`.
     """
     byte_lock.close_all()
     _map(segment, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS, 0, -1)
     file = os.fstat(segment.fd)
     nothing = os.open(os.devnull, os.O_RDONLY)
-    # Python's `mmap` has it open, too.
+    # Python's `mmap` object has a descriptor of the segment, too.
     for fd in [int(entry.name) for entry in Path("/proc/self/fd").iterdir()]:
         with suppress(OSError):
             if os.path.samestat(os.fstat(fd), file):
@@ -93,8 +99,9 @@ def leave(segment: Segment) -> None:
 
 
 def enter(segment: Segment, rack: str) -> None:
-    """Redirect the views of `segment` to the segment of another rack with the same layout. Takes no
-    lock and claims no mailbox.
+    """Redirect the views of `segment` to the segment of another rack with the same layout.
+
+    No lock is taken and no mailbox is claimed.
     """
     fd = os.open(shm_path(rack), os.O_RDWR)
     segment.rack = rack
@@ -105,7 +112,7 @@ def enter(segment: Segment, rack: str) -> None:
 
 
 def _map(segment: Segment, flags: int, rights: int, fd: int) -> None:
-    """Map a file, or nothing, in the place of a segment's memory."""
+    """Map a file, or anonymous memory for `fd` -1, at the address of a segment's memory."""
     place = ctypes.addressof(ctypes.c_char.from_buffer(segment.bytes))
     size = segment.map.size
     if _libc.mmap(place, size, rights, flags | _MAP_FIXED, fd, 0) != place:

@@ -1,9 +1,9 @@
-"""The exception tree of the bus, with the cause of each error.
+"""Exceptions of the backplane, with the cause of each.
 
-`BackplaneError` is the root: catch it and every refusal of this package is caught.
+`BackplaneError` is the root. Catching it catches every error that this package raises on purpose.
 
 - `SegmentError`: a rack name that is in use, a segment of another layout or owner, a full /dev/shm.
-- `DamageError`: shared memory that holds what no process of the rack writes.
+- `DamageError`: shared memory with a content that no process of the rack writes.
 - `MailboxError`: an unknown mailbox, a second writer, a message that does not fit its type.
 - `ClockError`: a rate that does not divide the clock, or is not a rate.
 - `FaultTableError`: more faults than one run can have.
@@ -15,39 +15,39 @@ from __future__ import annotations
 
 
 class BackplaneError(Exception):
-    """Root of every error this package raises; its text is one line for the user."""
+    """Root of all errors of this package. Its text is one line for the user."""
 
 
 class SegmentError(BackplaneError):
-    """A segment that cannot be made, attached or removed."""
+    """Raised if a segment cannot be created, attached or removed."""
 
 
 class RackInUseError(SegmentError):
-    """The segment of a rack that is running."""
+    """Raised if the segment belongs to a running rack."""
 
 
 class DamageError(SegmentError):
-    """Shared memory that holds what no process of the rack writes there."""
+    """Raised if shared memory has a content that no process of the rack writes."""
 
-    def __init__(self, what: str) -> None:
-        super().__init__(f"the rack's shared memory is damaged: {what}")
+    def __init__(self, detail: str) -> None:
+        super().__init__(f"the rack's shared memory is damaged: {detail}")
 
 
 class MailboxError(BackplaneError):
-    """A mailbox that cannot be opened, claimed or matched with a message type."""
+    """Raised if a mailbox cannot be opened, claimed or matched with a message type."""
 
 
 class ClockError(BackplaneError):
-    """A rate or a period that the system clock cannot keep."""
+    """Raised for a rate or a period that the system clock cannot keep."""
 
 
 class FaultTableError(BackplaneError):
-    """A fault that cannot be injected."""
+    """Raised if a fault cannot be injected."""
 
 
 class OperatorTableError(BackplaneError):
-    """A command that cannot be handed over."""
+    """Raised if a command cannot be handed over."""
 
 
 class EmergencyStopError(BackplaneError):
-    """A latch that cannot be reset."""
+    """Raised if the emergency-stop latch cannot be reset."""

@@ -1,5 +1,6 @@
-"""Exports of a package, imported on first use: a user of one name does not wait for the libraries
-of the others.
+"""Names of a package that are imported on first use.
+
+A program that uses one name does not wait for the libraries that other names need.
 """
 
 from __future__ import annotations
@@ -10,8 +11,11 @@ from typing import Any
 
 
 def on_first_use(package: str, places: Mapping[str, Sequence[str]]) -> Callable[[str], Any]:
-    """Return the `__getattr__` of a package that exports names of other modules: `places` lists
-    them by module.
+    """Build the module-level `__getattr__` of a package that imports its names on first use.
+
+    Args:
+        package: Name of the package, for error messages.
+        places: Exported names by the module that defines them.
     """
     module_of = {name: module for module, names in places.items() for name in names}
 

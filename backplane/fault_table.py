@@ -1,9 +1,8 @@
-"""The fault table: the faults injected into a rack, in shared memory, in the system controller's
-window.
+"""Table of the faults injected into a rack, in the system controller's shared-memory window.
 
 Any process may add an entry. Only the clock, at the beginning of a tick, decides which faults begin
-and end: all tasks of a tick see the same faults, and a run in lockstep repeats with them. The table
-holds numbers; `boards` knows the meaning of kinds and parameters.
+and end. All tasks of a tick therefore see the same faults, and a lockstep run repeats with the same
+faults. The table holds numbers, and `boards` knows the meaning of kinds and parameters.
 """
 
 from __future__ import annotations
@@ -21,9 +20,9 @@ from rack.backplane.words import System, Word
 
 FAULT_WORDS = 16
 PARAMETERS = 8
-"""Parameters of one fault, float64, after its words."""
+"""Number of parameters of one fault, float64, stored after its words."""
 NEVER = 1 << 62
-"""`until` of a fault that lasts until the end of the run."""
+"""Value of `until` for a fault that lasts until the end of the run."""
 
 
 class Stage(IntEnum):
@@ -37,8 +36,9 @@ class Stage(IntEnum):
 
 @dataclass(frozen=True)
 class Injection:
-    """One fault as an entry holds it: see `FaultEntry`. `when` is (mailbox, field, value): two
-    indices and a number.
+    """Description of one fault before it is entered into the table.
+
+    See `FaultEntry` for the fields. `when` is a condition (mailbox index, field index, value).
     """
 
     kind: int
@@ -53,30 +53,31 @@ class Injection:
 
 
 class FaultEntry:
-    """One entry of the table: `words` and `parameters` are views of shared memory.
+    """Entry of the fault table. `words` and `parameters` are views of shared memory.
 
-    Once it waits, the clock writes `stage`, `tick` and `until`, its actor the words from
-    `struck_tick` on.
+    Once the fault is waiting, the clock writes `stage`, `tick` and `until`. The process that
+    applies the fault writes the words from `struck_tick` on.
     """
 
     stage = Word(0)  # Stage
     kind = Word(1)  # number of the kind, from its name
-    task = Word(2)  # index among the layout's tasks; -1: the clock
-    # index among the layout's mailboxes; -1: every one that the task writes, or none
+    task = Word(2)  # index among the layout's tasks, -1 for the clock
+    # Index among the layout's mailboxes, -1 for every mailbox that the task writes, or for none.
     mailbox = Word(3)
-    # first tick of the fault; -1: as soon as possible, or when its condition holds
+    # First tick of the fault, -1 for as soon as possible or when its condition holds.
     tick = Word(4)
-    until = Word(5)  # first tick after it; known once it has begun
-    ticks = Word(6)  # duration; 0: until the end of the run, or once, depending on the kind
-    phase = Word(7)  # part of its first tick after which it strikes, in 1/1000
+    until = Word(5)  # first tick after the fault, known once it has begun
+    # Duration, 0 for until the end of the run, or once, depending on the kind.
+    ticks = Word(6)
+    phase = Word(7)  # part of its first tick after which it acts, in 1/1000
     seed = Word(8)
-    when_box = Word(9)  # condition: index of a mailbox; -1: none
-    when_field = Word(10)  # index of a field in it
-    when_value = Word(11)  # number that the field must equal
-    struck_tick = Word(12)  # tick at which it first changed anything, however little; -1: not yet
-    struck_ns = Word(13)  # CLOCK_MONOTONIC at that time
-    count = Word(14)  # times it acted so much that it must be found
-    hidden = Word(15)  # ticks from `struck_tick` to the first of these times
+    when_box = Word(9)  # condition: index of a mailbox, -1 for none
+    when_field = Word(10)  # condition: index of a field of the mailbox
+    when_value = Word(11)  # condition: number that the field must equal
+    struck_tick = Word(12)  # tick at which it first had any effect, -1 before
+    struck_ns = Word(13)  # CLOCK_MONOTONIC of that effect
+    count = Word(14)  # number of effects that a detector is required to notice
+    hidden = Word(15)  # ticks from `struck_tick` to the first effect that counts
 
     def __init__(self, segment: Segment, index: int) -> None:
         address = segment.map.faults + index * FAULT_ENTRY_SIZE
@@ -85,8 +86,12 @@ class FaultEntry:
         self.parameters = segment.view(address + 8 * FAULT_WORDS, 8 * PARAMETERS).cast("d")
 
     def acted(self, tick: int, shows: bool = True) -> None:
-        """Note one action of the fault, and the time of the first one; count those that show: they
-        must be found.
+        """Record one action of the fault.
+
+        Args:
+            tick: Tick of the action. The first action also sets `struck_tick` and `struck_ns`.
+            shows: True if a detector is required to notice this action. Only such actions are
+                counted.
         """
         if self.struck_tick < 0:
             self.struck_ns = monotonic_ns()
@@ -97,7 +102,7 @@ class FaultEntry:
 
 
 class FaultTable:
-    """The table of one rack. `entries` holds all entries, free ones too."""
+    """Fault table of one rack. `entries` contains all entries, including free ones."""
 
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
@@ -106,14 +111,17 @@ class FaultTable:
 
     @property
     def generation(self) -> int:
-        """Rises when a fault begins or ends: a task looks at the table only when this number has
-        changed.
+        """Number that rises when a fault begins or ends.
+
+        A task reads the table only when this number has changed.
         """
         return self._words[System.FAULTS]
 
     def add(self, injection: Injection) -> FaultEntry:
-        """Fill a free entry; its fault begins when the clock finds it due. Raises
-        `FaultTableError`.
+        """Fill a free entry. The fault begins when the clock finds it due.
+
+        Raises:
+            FaultTableError: The table is full.
         """
         with locked(self._segment.fd, self._segment.map.faults):
             entry = next((e for e in self.entries if e.stage == Stage.FREE), None)
@@ -128,25 +136,25 @@ class FaultTable:
             entry.struck_tick = -1
             for place, parameter in enumerate(injection.parameters):
                 entry.parameters[place] = parameter
-            # Last: from here the clock may begin it.
+            # This is stored last, because from now on the clock may begin the fault.
             entry.stage = Stage.WAITING
             self._words[System.INJECTED] += 1
         return entry
 
     def disarm(self, entry: FaultEntry) -> None:
-        """Keep a waiting fault from beginning; `free` may follow after the next tick."""
-        # In this order: without a condition and with a tick that has passed, it would begin at
-        # once.
+        """Keep a waiting fault from beginning. `free_entry` may be called after the next tick."""
+        # The order matters: without a condition and with a tick in the past, the fault would begin
+        # at once.
         entry.tick = NEVER
         entry.when_box = -1
 
     def free(self, entry: FaultEntry) -> bool:
-        """Free the entry of a disarmed fault; False when the clock has already begun it."""
+        """Free the entry of a disarmed fault. Returns False if the clock has already begun it."""
         if entry.stage != Stage.WAITING:
             return False
         entry.stage = Stage.FREE
         return True
 
     def staged(self, stages: Sequence[Stage]) -> list[FaultEntry]:
-        """Return the entries in one of these stages."""
+        """Return the entries in one of the given stages."""
         return [e for e in self.entries if e.stage in stages]

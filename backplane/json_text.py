@@ -1,6 +1,6 @@
-"""Strict JSON: the one place of the project that encodes it.
+"""Strict JSON encoder, the only one in the project.
 
-JSON has no NaN and no infinity, and programs that read JSON refuse a file that holds one.
+JSON has no NaN and no infinity, and programs that read JSON reject a file that contains one.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any
 
 
 def encode_json(document: Any, indent: int | None = None) -> str:
-    """Return plain data as JSON, with null in place of every number that is not finite."""
+    """Encode plain data as JSON, with null for every number that is not finite."""
     try:
         return json.dumps(document, indent=indent, allow_nan=False)
     except ValueError:
@@ -19,6 +19,7 @@ def encode_json(document: Any, indent: int | None = None) -> str:
 
 
 def _replace_infinite(value: Any) -> Any:
+    """Return a copy of plain data in which None replaces NaN and infinities."""
     if isinstance(value, dict):
         return {key: _replace_infinite(inner) for key, inner in value.items()}
     if isinstance(value, list | tuple):

@@ -1,6 +1,6 @@
-"""The layout of a backplane: its mailboxes and tasks, as plain data.
+"""Layout of a backplane: its mailboxes and tasks, as plain data.
 
-The Rack computes a layout from its config. The segment is laid out from it and carries it as text,
+The Rack computes the layout from its config. The segment is arranged by it and contains it as text,
 so a tool that attaches by name knows every mailbox and every task without importing the config's
 classes.
 """
@@ -20,33 +20,40 @@ BY_TICKS: tuple[Protocol, ...] = ("time-slice", "queue", "interrupt")
 """Protocols under which messages become visible at ticks fixed in advance."""
 
 Role = Literal["executor", "planner", "host"]
-"""A "host" is a board of the host side: it has no rate, and the clock does not release it."""
+"""Kind of task. A "host" is a host board: it has no rate, and the clock does not release it."""
 
 KIND = re.compile(r"[<>|]?[biufcSUV]\d+")
-"""Kinds of fields. A layout may be another user's: numpy would take an object of Python's from the
-number in a message."""
+"""Pattern of numpy type strings that a field may have.
+
+A layout may come from another user's segment. An object type would make numpy interpret a number in
+a message as the address of a Python object.
+"""
 
 Wake = Literal["signal", "timer", "poll"]
-"""How a task waits for its next cycle: see `rack.backplane.clock.wake`."""
+"""Method by which a task waits for its next cycle: see `rack.backplane.clock.wake`."""
 
 
 class TickGrid(NamedTuple):
-    """The ticks `phase`, `phase` + `every`, ..., with `phase` < `every`."""
+    """The ticks `phase`, `phase` + `every`, and so on, with `phase` < `every`."""
 
     every: int
     phase: int = 0
 
     def since(self, tick: int) -> int:
-        """Return the first of them at `tick` or later, `tick` not being negative."""
+        """Return the first tick of the grid at `tick` or later. `tick` must not be negative."""
         return tick + (self.phase - tick) % self.every
 
 
 @dataclass(frozen=True)
 class ExchangeSpec:
-    """How the executor `task` reads a mailbox, if the config says so: at the ticks `phase`, `phase`
-    + `every`, ...
+    """Rule of a config for how an executor reads a mailbox.
 
-    `asynchronous`: it gets the newest message as soon as that is whole, whatever the protocol.
+    Attributes:
+        task: The executor.
+        every: Period of its reads, in ticks.
+        phase: Tick of its first read.
+        asynchronous: True if it reads the newest message as soon as that is complete, under any
+            protocol.
     """
 
     task: str
@@ -56,19 +63,23 @@ class ExchangeSpec:
 
     @property
     def grid(self) -> TickGrid:
-        """The ticks at which it reads."""
+        """Ticks at which the executor reads."""
         return TickGrid(self.every, self.phase)
 
 
 @dataclass(frozen=True)
 class InterruptSpec:
-    """How the messages of a mailbox travel under protocol interrupt. Its times are of the rack's
-    own clock.
+    """Sending and service times of a mailbox's messages under protocol interrupt.
 
-    A message is sent `sent_ns` after the release that writes it; it must be there before the tick
-    `due` after that release. It interrupts the boards in `slots`; at each a handler serves it for
-    `service_ns`, and `depth` messages wait at most. It is written in the cycles released `ahead`
-    ticks before the multiples of the mailbox's period.
+    Times refer to the clock of this rack.
+
+    Attributes:
+        sent_ns: Time from the release that writes a message until it is sent.
+        service_ns: Time for which an interrupt handler serves a message.
+        depth: Maximum number of messages that wait for a handler.
+        due: Ticks after the release before which the message must be in memory.
+        ahead: Ticks between the writing release and the next multiple of the mailbox's period.
+        slots: Slots of the boards that a message interrupts.
     """
 
     sent_ns: int
@@ -81,12 +92,18 @@ class InterruptSpec:
 
 @dataclass(frozen=True)
 class FieldSpec:
-    """One field of a mailbox's message, resolved: numpy type string, shape, byte offset, unit,
-    meaning.
+    """Field of a mailbox's message, with all sizes resolved.
 
-    `fields` holds the fields of a group (a nested message), `values` the names (lower case) and
-    numbers of an enum, `length` the least and the greatest one of a vector, or magnitude of a
-    number.
+    Attributes:
+        name: Name of the field.
+        kind: numpy type string.
+        shape: Shape of an array, () for a scalar.
+        offset: Byte offset in the message.
+        unit: Unit as text.
+        meaning: Meaning of the value.
+        fields: Fields of a group, which is a nested message.
+        values: Names in lower case and numbers of an enum.
+        length: Least and greatest length of a vector, or magnitude of a number.
     """
 
     name: str
@@ -101,22 +118,35 @@ class FieldSpec:
 
     def __post_init__(self) -> None:
         if not KIND.fullmatch(self.kind):
-            raise ValueError(f"a field of kind {self.kind}")
+            raise ValueError(f"a field cannot have the kind {self.kind}")
 
 
 @dataclass(frozen=True)
 class MailboxSpec:
-    """One mailbox: its writer and readers, its message, its protocol.
+    """Description of one mailbox. Times are in ticks.
 
-    `every` is the time from message to message and `delay` the time from release to visibility,
-    both in ticks; messages become visible at multiples of `every`, counted from tick `phase`.
-    `depth` is the number of slots, a power of two. `rests_on` names the mailboxes on whose
-    information its messages rest, all read by its writer; queues, in which messages wait, are not
-    among them. `capacity`: of a queue, the largest number of unread messages; 0: it is no queue.
-    `exchanges` are the readers that do not simply read it in every cycle. `max_age`, ticks: of a
-    mailbox written only when there is something new, the age of its information from which readers
-    take the writer for lost; 0: it is written in every period. `interrupt`: of protocol interrupt;
-    `delay` is then the time to the earliest visibility.
+    Attributes:
+        name: Name of the mailbox.
+        writer: Task that writes it.
+        readers: Tasks that read it.
+        protocol: When its messages become visible.
+        every: Period of the messages. They become visible at multiples of it, counted from
+            `phase`.
+        delay: Ticks from a release until its message is visible; the least under protocol
+            interrupt.
+        depth: Number of slots, a power of two.
+        message: Name of the message type.
+        version: Version of the message type.
+        size: Size of a message in bytes.
+        fields: Fields of the message.
+        rests_on: Mailboxes on whose information its messages depend, without queues. Its writer
+            reads all of them.
+        capacity: Maximum number of unread messages of a queue. 0 for other protocols.
+        phase: First tick at which a message can become visible.
+        exchanges: Readers that do not simply read it in every cycle.
+        max_age: Age of the information from which readers treat the writer as lost, for a
+            mailbox written on demand. 0 for a mailbox written in every period.
+        interrupt: How messages are sent under protocol interrupt, otherwise None.
     """
 
     name: str
@@ -139,29 +169,37 @@ class MailboxSpec:
 
     @property
     def ahead(self) -> int:
-        """How long before a multiple of its period the cycle is released that writes it, ticks."""
+        """Ticks from the release of the writing cycle to the next multiple of the period."""
         return self.delay if self.interrupt is None else self.interrupt.ahead
 
     @property
     def is_by_ticks(self) -> bool:
-        """Whether its messages become visible by ticks alone."""
+        """True if ticks alone decide when its messages become visible."""
         return self.protocol in BY_TICKS
 
     @property
     def is_repeatable(self) -> bool:
-        """Whether what each of its readers gets depends on ticks alone."""
+        """True if ticks alone decide which message each reader gets."""
         return self.is_by_ticks and not any(exchange.asynchronous for exchange in self.exchanges)
 
 
 @dataclass(frozen=True)
 class TaskSpec:
-    """One schedulable task: the executor of a board or its planner.
+    """A schedulable task: the executor or the planner of a board, or a host board.
 
-    `name` is "servo" for an executor and "servo.planner" for a planner. `every` is the period in
-    ticks; releases are the ticks `phase`, `phase` + `every`, ... `within_cycles` is the cycles that
-    one plan may take. `priority` is SCHED_FIFO's, 0 for ordinary scheduling. `depth` is the number
-    of records in its trace ring, a power of two. `wake`: how it waits for its next cycle in real
-    time. `is_external`: a host board that the rack does not start.
+    Attributes:
+        name: "servo" for an executor, "servo.planner" for its planner.
+        board: Name of the board.
+        role: Kind of task.
+        slot: VME slot of the board.
+        core: Processor core to which the task is pinned.
+        priority: SCHED_FIFO priority, 0 for ordinary scheduling.
+        every: Period in ticks.
+        within_cycles: Number of cycles that one plan may take.
+        depth: Number of records in its trace ring, a power of two.
+        wake: How it waits for its next cycle in real time.
+        phase: Tick of its first release.
+        is_external: True for a host board that the rack does not start.
     """
 
     name: str
@@ -179,12 +217,12 @@ class TaskSpec:
 
     @property
     def grid(self) -> TickGrid:
-        """Its releases."""
+        """Release ticks of the task."""
         return TickGrid(self.every, self.phase)
 
     @property
     def slice(self) -> int:
-        """Time for one cycle, or one plan, ticks."""
+        """Time for one cycle or one plan, in ticks."""
         return self.every * self.within_cycles
 
     def count_unfinished(self, done: int, tick: int) -> int:
@@ -194,9 +232,14 @@ class TaskSpec:
 
 @dataclass(frozen=True)
 class Layout:
-    """Everything on one backplane. `clock_ns` is the period of the system clock.
+    """Everything on one backplane.
 
-    `tasks` are those that the clock releases, `hosts` the boards of the host side.
+    Attributes:
+        rack: Name of the rack.
+        clock_ns: Period of the system clock.
+        tasks: Tasks that the clock releases.
+        mailboxes: All mailboxes.
+        hosts: Host boards, which the clock does not release.
     """
 
     rack: str
@@ -207,18 +250,19 @@ class Layout:
 
     @property
     def processes(self) -> tuple[TaskSpec, ...]:
-        """Everything that runs as a process of its own: tasks, then host boards."""
+        """All tasks, followed by the host boards. Each runs as one process."""
         return self.tasks + self.hosts
 
     @property
     def timed(self) -> tuple[MailboxSpec, ...]:
-        """The mailboxes that tasks and clock write, at ticks."""
+        """Mailboxes that tasks and the clock write at ticks."""
         hosts = {host.name for host in self.hosts}
         return tuple(mailbox for mailbox in self.mailboxes if mailbox.writer not in hosts)
 
     def pacers(self, host: TaskSpec) -> set[str]:
-        """Return the bus adapters in whose cycles a host board's program runs in lockstep: none of
-        an external one.
+        """Return the bus adapters that pace a host board's program in lockstep.
+
+        The set is empty for an external host board.
         """
         return {
             task.name
@@ -228,21 +272,31 @@ class Layout:
         }
 
     def mailbox(self, name: str) -> MailboxSpec:
-        """Return the mailbox of that name. Raises `KeyError`."""
+        """Return the mailbox with this name.
+
+        Raises:
+            KeyError: There is no such mailbox.
+        """
         return {m.name: m for m in self.mailboxes}[name]
 
     def index(self, mailbox: str) -> int:
-        """Return the place of the mailbox of that name among all. Raises `ValueError`."""
+        """Return the index of the mailbox with this name.
+
+        Raises:
+            ValueError: There is no such mailbox.
+        """
         return [box.name for box in self.mailboxes].index(mailbox)
 
     def task(self, name: str) -> TaskSpec:
-        """Return the task, or the host board, of that name. Raises `KeyError`."""
+        """Return the task or host board with this name.
+
+        Raises:
+            KeyError: There is no such task.
+        """
         return {t.name: t for t in self.processes}[name]
 
     def due(self, task: TaskSpec) -> int:
-        """Return the ticks from a release of a task until the first of its messages must be
-        there.
-        """
+        """Return the ticks from a release until the task's first message is required."""
         sent = [
             m.interrupt.due
             for m in self.mailboxes
@@ -251,34 +305,49 @@ class Layout:
         return min([task.every, *sent])
 
     def interrupting(self, slot: int) -> list[MailboxSpec]:
-        """Return the mailboxes whose messages interrupt the board in a slot, by the slot of their
-        sender.
+        """Return the mailboxes that interrupt the board in a slot.
+
+        They are ordered by the slot of their sender.
         """
-        found = [m for m in self.mailboxes if m.interrupt is not None and slot in m.interrupt.slots]
-        return sorted(found, key=lambda mailbox: self.task(mailbox.writer).slot)
+        mailboxes = [
+            m for m in self.mailboxes if m.interrupt is not None and slot in m.interrupt.slots
+        ]
+        return sorted(mailboxes, key=lambda mailbox: self.task(mailbox.writer).slot)
 
     def handler(self, slot: int) -> str:
-        """Return the task that serves the interrupts of the board in a slot: its first one. Raises
-        `StopIteration`.
+        """Return the task that serves the interrupts of the board in a slot, its first task.
+
+        Raises:
+            StopIteration: There is no task in this slot.
         """
         return next(task.name for task in self.tasks if task.slot == slot)
 
     def read_grid(self, mailbox: MailboxSpec, reader: str) -> TickGrid:
-        """Return the ticks at which a task reads a mailbox; a planner's, its releases. Raises
-        `KeyError`.
+        """Return the ticks at which a task reads a mailbox. A planner reads at its releases.
+
+        Raises:
+            KeyError: There is no such task.
         """
         exchanged = (e.grid for e in mailbox.exchanges if e.task == reader)
         return max(exchanged, default=self.task(reader).grid)
 
 
 SPARE = 2
-"""Slots of a host board's mailbox more than messages may wait: the one being written, and one that
-the adapter copies meanwhile."""
+"""Slots of a host board's mailbox in addition to the messages that may wait.
+
+One is being written, and one is being copied by the bus adapter.
+"""
 
 
 def depth_for(span_ticks: int, every: int) -> int:
-    """Return the slots, a power of two and at least 4, that keep `span_ticks` ticks of a writer of
-    period `every`.
+    """Return the number of slots that hold the messages of `span_ticks` ticks.
+
+    Args:
+        span_ticks: Length of the time span.
+        every: Period of the writer, in ticks.
+
+    Returns:
+        A power of two, at least 4.
     """
-    wanted = max(4, -(-span_ticks // every) + 3)
-    return 1 << (wanted - 1).bit_length()
+    slot_count = max(4, -(-span_ticks // every) + 3)
+    return 1 << (slot_count - 1).bit_length()

@@ -1,15 +1,14 @@
-"""A real-time process's memory: all there before the first cycle, so that no cycle waits for a
-page.
+"""Memory of a real-time process, prepared so that no cycle waits for a page.
 
-A board is forked from the crate and shares its memory. Left alone, the first write to each page
-copies it, the first access to each page of the segment or of a library maps it, and the C library
-returns freed memory to the kernel only to ask for it again: a page fault in every second cycle for
-the first seconds, and in rare code paths at any later time.
+A board is forked from the crate and shares its memory. Without preparation, the first write to each
+page copies it, the first access to each page of the segment or of a library maps it, and the C
+library returns freed memory to the kernel only to request it again. That is a page fault in every
+second cycle for the first seconds, and in rare code paths at any later time.
 
 `mlockall` without MCL_ONFAULT would do it in one call, but it also fills memory that was reserved
-and never used, twice of what a board needs, and later mappings at once. So pages are locked as they
-are touched, and touched here by kind: memory of the process itself where it is in use, files where
-the crate has used them, the segment whole.
+and never used, twice what a board needs, and later mappings at once. So pages are locked as they
+are touched. This module touches them by kind: memory of the process where it is in use, files where
+the crate has used them, and the whole segment.
 """
 
 from __future__ import annotations
@@ -34,20 +33,23 @@ _POPULATE_WRITE = 23
 _M_TRIM_THRESHOLD = -1
 _M_MMAP_MAX = -4
 RESERVE = 4 << 20
-"""Bytes of heap kept beyond those in use."""
+"""Heap kept in addition to the heap in use, in bytes."""
 GAP = 16
-"""Unused pages between used ones that are touched with them: one call takes as long as some
-pages."""
+"""Number of unused pages between used ones that are touched too.
+
+One call takes as long as touching some pages.
+"""
 _USER_END = 1 << 63
-"""Addresses from here on are the kernel's, as [vsyscall]."""
+"""First address of the kernel, which owns mappings such as [vsyscall]."""
 _PRESENT = 63
-"""Bit of /proc/self/pagemap: the page is in memory."""
+"""Bit of an entry of /proc/self/pagemap that is set if the page is in memory."""
 
 
 def hold_memory(lockstep: bool = False) -> None:
-    """Stop the garbage collector, and lock all memory, present and future, as it is touched.
+    """Disable the garbage collector, and lock present and future memory as it is touched.
 
-    Lockstep does without locks: they take a sixth of a launch, and no page is late there.
+    In lockstep nothing is locked. Locking takes a sixth of a launch, and a page fault has no effect
+    on the result.
     """
     if not lockstep:
         _libc.mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT)
@@ -60,8 +62,9 @@ _FILES: list[tuple[int, int]] = []
 
 
 def note_used_files() -> None:
-    """Note the pages of files that this process uses, for `touch_memory`: a fork does not inherit
-    their mapping.
+    """Record the pages of files that this process uses, for `touch_memory` in its forks.
+
+    A fork does not inherit the mapping of these pages.
     """
     _FILES[:] = [
         stretch for _, rights, pages in _mappings() if rights[:2] == "r-" for stretch in pages
@@ -69,29 +72,27 @@ def note_used_files() -> None:
 
 
 def touch_memory() -> None:
-    """Touch every page that a cycle may need, and let the C library keep what it has obtained.
+    """Touch every page that a cycle may need, and let the C library keep its memory.
 
-    It takes about a tenth of a second, mostly to copy what is shared with the crate.
+    This takes about a tenth of a second, mostly to copy pages that are shared with the crate.
     """
     _libc.mallopt(_M_TRIM_THRESHOLD, -1)
     _libc.mallopt(_M_MMAP_MAX, 0)
     reserve = ctypes.create_string_buffer(RESERVE)
     del reserve
-    for span, rights, used in _mappings():
+    for span, rights, stretches in _mappings():
         if rights == "rw-s":
-            used = [span]  # the segment: all of it
+            stretches = [span]  # the segment: all of it
         elif rights[1] != "w":
             continue
-        for first, last in used:
+        for first, last in stretches:
             _libc.madvise(first, last - first, _POPULATE_WRITE)
     for first, last in _FILES:
         _libc.madvise(first, last - first, _POPULATE_READ)
 
 
 def _mappings() -> Iterator[tuple[tuple[int, int], str, list[tuple[int, int]]]]:
-    """Yield span, rights and the stretches in memory of every mapping of this process that it may
-    read.
-    """
+    """Yield span, access rights and resident stretches of every readable mapping."""
     with Path("/proc/self/pagemap").open("rb", buffering=0) as pagemap:
         for line in Path("/proc/self/maps").read_text().splitlines():
             addresses, rights, *_ = line.split(maxsplit=2)
@@ -101,14 +102,14 @@ def _mappings() -> Iterator[tuple[tuple[int, int], str, list[tuple[int, int]]]]:
 
 
 def _used(pagemap: int, start: int, end: int) -> Iterator[tuple[int, int]]:
-    """Yield the stretches of a mapping that are in memory, as addresses."""
+    """Yield the resident stretches of a mapping as pairs of addresses."""
     page = mmap.PAGESIZE
     entries = np.frombuffer(os.pread(pagemap, (end - start) // page * 8, start // page * 8), "u8")
-    used = np.flatnonzero(entries >> _PRESENT)
-    if not len(used):
+    pages = np.flatnonzero(entries >> _PRESENT)
+    if not len(pages):
         return
-    breaks = np.flatnonzero(np.diff(used) > GAP)
-    firsts = used[np.append(0, breaks + 1)]
-    lasts = used[np.append(breaks, len(used) - 1)] + 1
+    breaks = np.flatnonzero(np.diff(pages) > GAP)
+    firsts = pages[np.append(0, breaks + 1)]
+    lasts = pages[np.append(breaks, len(pages) - 1)] + 1
     for first, last in zip(firsts.tolist(), lasts.tolist(), strict=True):
         yield start + first * page, start + last * page

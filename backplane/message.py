@@ -1,4 +1,4 @@
-"""Messages are classes: a local copy of one message has every field as an attribute.
+"""Message classes, whose instances are local copies of one message with fields as attributes.
 
 ```python
 class PowerStatus(Status, version=1):
@@ -8,9 +8,9 @@ class PowerStatus(Status, version=1):
     torque: np.ndarray = field(unit="N m", doc="applied torque", shape="joints")
 ```
 
-A scalar is a `float`, an `int`, a `bool`, a `str` or a member of an `IntEnum`; every other
-annotation stands for an array. A status derives from `Status`, a command from `Command`. A class
-without a version is only a base of others.
+A scalar field is annotated `float`, `int`, `bool`, `str` or with an `IntEnum`. Every other
+annotation declares an array. A status derives from `Status`, a command from `Command`. A class
+without a version is only a base class.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from rack.backplane.message_type import Field, MessageType
 
 REASON_BYTES = 120
 COMMAND_ID = "id"
-"""First field of every command: its serial."""
+"""First field of every command: its serial number."""
 B = TypeVar("B", bound="Message")
 _KINDS: Mapping[type, tuple[str, str]] = {
     bool: ("u1", "u"),
@@ -40,10 +40,10 @@ _KINDS: Mapping[type, tuple[str, str]] = {
     IntEnum: ("u1", "iu"),
     np.ndarray: ("f8", "iufS"),
 }
-"""By type of a field: its numpy type unless the field states another, and the kinds permitted."""
+"""Default numpy type of a field and the permitted numpy kinds, by the annotated type."""
 _UNITS = {bool: "1", str: "ASCII"}
 _UNSTATED = "unstated"
-"""The unit, of any other type, of a field that states none."""
+"""Unit of a field that states none."""
 
 
 class State(IntEnum):
@@ -68,16 +68,16 @@ def field(
     """Declare a field of a message class.
 
     Args:
-        kind: Its numpy type if that is not the annotation's default (`f8` of a float or an array,
-            `i8` of an int, `u1` of a bool or an `IntEnum`, `S120` of a str); or a message class:
-            the field is one such group or, with a shape, an array of them.
-        doc: What it says.
-        unit: Its unit, "1" for a pure number, an `IntEnum` for an array of names; not given for a
-            bool, a str, an enumeration and a group.
+        kind: numpy type, if it is not the default of the annotation (`f8` for a float or an
+            array, `i8` for an int, `u1` for a bool or an `IntEnum`, `S120` for a str). A
+            message class declares a group of fields or, with a shape, an array of groups.
+        doc: Meaning of the value.
+        unit: Unit, "1" for a pure number, an `IntEnum` for an array of names. Not given for a
+            bool, a str, an enum or a group.
         shape: Shape of an array, of integers and symbolic sizes ("joints").
-        length: The least and the greatest length of a vector, or magnitude of a number, that is
-            taken from another rack.
-        default: Value in the first message that a level writes; otherwise all bytes are 0.
+        length: Least and greatest length of a vector, or magnitude of a number, that is
+            accepted from another rack.
+        default: Value in the first message that a level writes. None for all bytes 0.
     """
     sizes = shape if isinstance(shape, tuple) else (shape,)
     stored = kind if isinstance(kind, str) else kind.message_type
@@ -85,8 +85,10 @@ def field(
 
 
 def _named(declared: Field, name: str, hint: Any) -> Field:
-    """Return a declared field with the name and the annotation that stand beside it. Raises
-    `ValueError` with a reason.
+    """Complete a declared field with its name and its annotation.
+
+    Raises:
+        ValueError: The type, shape, unit or default does not suit the annotation.
     """
     if isinstance(declared.kind, MessageType):
         return replace(declared, name=name, unit="")
@@ -100,7 +102,7 @@ def _named(declared: Field, name: str, hint: Any) -> Field:
         raise ValueError(f"shape {declared.shape} does not suit {_name(hint)}")
     unit = hint if python is IntEnum else _UNITS.get(python, declared.unit)
     if unit == _UNSTATED:
-        raise ValueError('has no unit; of a pure number it is "1"')
+        raise ValueError('has no unit; the unit of a pure number is "1"')
     default = declared.default
     if default is not None and not _holds(kind, default):
         raise ValueError(f"default {default!r} does not fit numpy type '{kind}'")
@@ -108,27 +110,31 @@ def _named(declared: Field, name: str, hint: Any) -> Field:
 
 
 def make_message(name: str, version: int, base: type[B], fields: Mapping[str, Any]) -> type[B]:
-    """Return a message class whose fields a config decides: integers, and groups.
+    """Create a message class whose fields a config defines.
 
     Args:
-        name: Of the message.
-        version: Of the message.
+        name: Name of the message.
+        version: Version of the message.
         base: Class whose fields come first.
-        fields: What `field` returns, by name.
+        fields: Results of `field` by name, for integers and groups.
     """
     body = {**fields, "__annotations__": dict.fromkeys(fields, int), "__module__": __name__}
-    made: Any = type(name, (base,), body, version=version, message=name)
-    return made  # type: ignore[no-any-return]
+    message_class: Any = type(name, (base,), body, version=version, message=name)
+    return message_class  # type: ignore[no-any-return]
 
 
 class Message:
-    """A local copy of one message: a mailbox reads into it or writes from it.
+    """Local copy of one message, into which a mailbox reads or from which it writes.
 
-    Array fields are numpy views of `record`: fill them in place (`m.position[:] = q`) or assign
-    (`m.position = q`). Scalars read and assign as plain values, texts as `str`, see `text_of`.
-    A number that an enumeration does not name reads as a plain `int`: no reader fails because
-    another board, or another version of a rack, sent it. `record` is the structured array, shape
-    (), `raw` its bytes.
+    Array fields are numpy views of `record`. Fill them in place (`m.position[:] = q`) or assign to
+    them (`m.position = q`). Scalars are read and assigned as plain values, texts as `str` (see
+    `decode_text`). A number that an enum does not name is read as a plain `int`, so no reader fails
+    because another board, or another version of a rack, sent it.
+
+    Attributes:
+        raw: Bytes of the message.
+        record: Structured array of shape () over these bytes.
+        message_type: Name, version and fields of the message.
     """
 
     raw: memoryview
@@ -136,25 +142,27 @@ class Message:
     message_type: ClassVar[MessageType] = MessageType("", 0, ())
 
     def __init_subclass__(cls, version: int = 0, message: str = "") -> None:
-        """Collect the fields of a message class: those of its bases, then its own.
+        """Collect the fields of a message class, beginning with the fields of its bases.
 
         Args:
-            version: Of the message; it rises with every change of the fields. 0: the class is only
-                a base of others.
-            message: Name of the message; by default that of the class, as in "power_status".
+            version: Version of the message, which rises with every change of the fields. 0 for
+                a class that is only a base of others.
+            message: Name of the message. By default it is derived from the class, such as
+                "power_status".
 
         Raises:
-            MailboxError: No message may have such a field.
+            MailboxError: A message cannot have such a field.
         """
         fields = {f.name: f for base in cls.__bases__ for f in base.message_type.fields}  # type: ignore[attr-defined]
-        own = {name: d for name, d in vars(cls).items() if isinstance(d, Field)}
-        hints = get_type_hints(cls) if own else {}
-        for name, declared in own.items():
+        declared_fields = {name: d for name, d in vars(cls).items() if isinstance(d, Field)}
+        hints = get_type_hints(cls) if declared_fields else {}
+        for name, declared in declared_fields.items():
             try:
                 is_taken = hasattr(Message, name) or name in Message.__annotations__
                 if name.startswith("_") or is_taken or name not in hints:
                     raise ValueError(
-                        "permitted: annotated, no leading '_', no attribute of Message"
+                        "must be annotated, without leading '_', and not named like an attribute"
+                        " of Message"
                     )
                 fields[name] = _named(declared, name, hints[name])
             except (TypeError, ValueError) as error:
@@ -165,8 +173,8 @@ class Message:
         cls.message_type = MessageType(known_as, version, tuple(fields.values()))
 
     def __new__(cls, dtype: np.dtype, buffer: memoryview | None = None) -> Self:  # noqa: D102  # as the class
-        made: Self = object.__new__(_resolved(cls, dtype))  # type: ignore[arg-type]
-        return made
+        message: Self = object.__new__(_resolved(cls, dtype))  # type: ignore[arg-type]
+        return message
 
     def __init__(self, dtype: np.dtype, buffer: memoryview | None = None) -> None:
         raw = memoryview(bytearray(dtype.itemsize)) if buffer is None else buffer
@@ -176,8 +184,13 @@ class Message:
 
     @classmethod
     def zeros(cls, sizes: Mapping[str, int]) -> Self:
-        """Return a message of this class, all bytes 0; `sizes` by name. Raises `MailboxError` when
-        one is missing.
+        """Create a message of this class with all bytes 0.
+
+        Args:
+            sizes: Symbolic sizes by name.
+
+        Raises:
+            MailboxError: A size is missing.
         """
         return cls(cls.message_type.dtype(sizes))
 
@@ -192,7 +205,7 @@ class Message:
     if not TYPE_CHECKING:
         # A type checker knows the fields of a message class.
         def __setattr__(self, name: str, value: Any) -> None:
-            # One call for all fields: the setter of a property would be a second one.
+            # A property setter per field would cost a second call.
             try:
                 self._views[name][...] = value
             except KeyError:
@@ -204,17 +217,18 @@ class Message:
             raise AttributeError(self._unknown(name))
 
     def _unknown(self, name: str) -> str:
+        """Describe an access to an unknown field, with the nearest field name."""
         names = self.record.dtype.names or ()
         near = get_close_matches(name, names, 1)
-        what = f"did you mean '{near[0]}'?" if near else f"fields: {', '.join(names)}"
-        return f"message '{self.message_type.name}' has no field '{name}'; {what}"
+        hint = f"did you mean '{near[0]}'?" if near else f"fields: {', '.join(names)}"
+        return f"message '{self.message_type.name}' has no field '{name}'; {hint}"
 
     def __repr__(self) -> str:
         return f"Message({ {n: self.record[n].tolist() for n in self.record.dtype.names or ()} })"
 
 
 class AnyMessage(Message):
-    """A message whose fields are known at run time alone."""
+    """Message whose fields are known only at run time."""
 
     if TYPE_CHECKING:
 
@@ -223,20 +237,20 @@ class AnyMessage(Message):
 
 
 def integer(doc: str, kind: str = "u4") -> Any:
-    """Declare a field that counts or numbers something, by a pure number of an integer type."""
+    """Declare an integer field without a unit, such as a count or an index."""
     return field(kind, unit="1", doc=doc)
 
 
 def text_of(content: bytes | bytearray) -> str:
-    """Return the content of a text field for people: see `printable`."""
+    """Decode a text field for display, with control characters escaped."""
     return printable(content.decode("ascii", "replace"))
 
 
 def printable(text: str) -> str:
     """Return a text with control characters as escapes.
 
-    Texts come from other racks and from levels of users, and end on terminals, which would obey an
-    escape sequence.
+    Texts come from other racks and from users' levels and end up on terminals, which would execute
+    an escape sequence.
     """
     if text.isprintable():
         return text
@@ -244,27 +258,31 @@ def printable(text: str) -> str:
 
 
 def reason_of(status: Message) -> str:
-    """Return the reason in a level's status; empty for a status of a user's level without one."""
+    """Return the reason in a level's status. Empty if a user's status has no such field."""
     return str(getattr(status, "reason", ""))
 
 
 def state_name(state: int | None, otherwise: str = "") -> str:
-    """Return the name of a level's state; of a user's level that has others, `otherwise` or the
-    number.
+    """Return the name of a level's state in lower case.
+
+    Args:
+        state: Number of the state.
+        otherwise: Result for a state that `State` does not define. Empty for the number itself.
     """
     return State(state).name.lower() if state in set(State) else otherwise or str(state)
 
 
 def copied(message: B) -> B:
-    """Return a copy of a message, in memory of its own."""
+    """Return a copy of a message that does not share memory with it."""
     copy: B = object.__new__(type(message))
     copy.__init__(message.record.dtype, memoryview(bytearray(message.raw)))  # type: ignore[misc]
     return copy
 
 
 def fill_counts(record: Any, counts: Iterable[float]) -> None:
-    """Fill the fields of a record; an integer stays at the greatest that its field holds, whoever
-    drives it.
+    """Fill the fields of a record with counts.
+
+    A count that is too large for an integer field is stored as the largest value of the field.
     """
     kinds = (kind for kind, *_ in record.dtype.fields.values())
     record[...] = tuple(
@@ -274,12 +292,13 @@ def fill_counts(record: Any, counts: Iterable[float]) -> None:
 
 @cache
 def _greatest(kind: np.dtype) -> float:
+    """Return the largest value that a numpy type can store."""
     return np.iinfo(kind).max if kind.kind in "iu" else np.inf
 
 
 @cache
 def _resolved(cls: type[B], dtype: np.dtype) -> type[B]:
-    """Return the subclass of a message class with a property per scalar of this dtype."""
+    """Return a subclass of a message class with a property for each scalar of this dtype."""
     declared = {field.name: field for field in cls.message_type.fields}
     columns = {name: dtype[name] for name in dtype.names or ()}
     body = {
@@ -289,11 +308,12 @@ def _resolved(cls: type[B], dtype: np.dtype) -> type[B]:
     }
     kind = cls.message_type
     options = {"version": kind.version, "message": kind.name}
-    made: Any = type(cls.__name__, (cls,), body, **options)
-    return made  # type: ignore[no-any-return]
+    resolved_class: Any = type(cls.__name__, (cls,), body, **options)
+    return resolved_class  # type: ignore[no-any-return]
 
 
 def _scalar(name: str, dtype: np.dtype, declared: Field | None) -> property:
+    """Build the property that reads a scalar field as a plain Python value."""
     if dtype.kind == "S":
         return property(lambda self: text_of(self._views[name].item()))
     if declared is not None and declared.python is bool:
@@ -305,11 +325,12 @@ def _scalar(name: str, dtype: np.dtype, declared: Field | None) -> property:
 
 
 def _name(hint: Any) -> str:
+    """Return the name of an annotation for an error message."""
     return str(getattr(hint, "__name__", hint))
 
 
 def _holds(kind: str, value: Any) -> bool:
-    """Say whether a numpy type holds a value as it is."""
+    """Check whether a numpy type stores a value without changing it."""
     try:
         stored = np.array(value, kind)
     except (OverflowError, TypeError, ValueError):
@@ -319,13 +340,13 @@ def _holds(kind: str, value: Any) -> bool:
 
 
 class Command(Message):
-    """Base of the commands to a level."""
+    """Base class of the commands to a level."""
 
     id: int = field("u4", unit="1", doc="serial of the command; 0: no command")
 
 
 class Status(Message):
-    """Base of the statuses of levels."""
+    """Base class of the statuses of levels."""
 
     echo: int = field("u4", unit="1", doc="serial of the command that this status answers")
     state: State = field(doc="idle, executing, done, error or holding")

@@ -1,7 +1,7 @@
 """Message types: fixed numpy structured layouts, documented field by field.
 
-A message type is declared once, as a class (see `rack.backplane.message`), with symbolic sizes
-("joints"), which a rack resolves from its config.
+A message type is declared as a class (see `rack.backplane.message`) with symbolic sizes ("joints"),
+which a rack resolves from its config.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ from rack.backplane.errors import MailboxError
 
 @dataclass(frozen=True)
 class Field:
-    """One field of a message.
+    """Declaration of one field of a message.
 
     Attributes:
-        name: Its name.
-        kind: A numpy type string or, for a group of fields, the type of the group.
-        unit: Its unit; of a number that stands for a name, the enumeration.
-        meaning: What it says.
-        shape: Integers and symbolic sizes; empty for a scalar.
-        length: The least and the greatest length that a vector, along its last axis, or the
-            magnitude of a number may have.
-        python: `bool`, `int`, `float`, `str`, `IntEnum` or `np.ndarray`; `object` if the field is
-            a group, or was made at run time.
-        default: Value in the first message that a level writes; None: all bytes are 0.
+        name: Name of the field.
+        kind: numpy type string or, for a group of fields, the type of the group.
+        unit: Unit as text or, for numbers that stand for names, the enum.
+        meaning: Meaning of the value.
+        shape: Integers and symbolic sizes, () for a scalar.
+        length: Least and greatest length of a vector along its last axis, or magnitude of a
+            number.
+        python: `bool`, `int`, `float`, `str`, `IntEnum` or `np.ndarray`. `object` for a group
+            or a field made at run time.
+        default: Value in the first message that a level writes. None for all bytes 0.
     """
 
     name: str
@@ -45,7 +45,7 @@ class Field:
 
 @dataclass(frozen=True)
 class MessageType:
-    """A named, versioned layout. `fields` are ordered by offset."""
+    """Named and versioned message layout. `fields` are ordered by offset."""
 
     name: str
     version: int
@@ -54,8 +54,11 @@ class MessageType:
     def dtype(self, sizes: Mapping[str, int]) -> np.dtype:
         """Return the numpy dtype with every symbolic size filled in.
 
-        Padding is explicit in numpy's aligned layout, zeroed once at creation and never written, so
-        that equal messages have equal bytes.
+        Padding is explicit in numpy's aligned layout, zeroed at creation and never written, so
+        equal messages have equal bytes.
+
+        Args:
+            sizes: Symbolic sizes by name.
 
         Raises:
             MailboxError: `sizes` lacks a size.
@@ -63,6 +66,7 @@ class MessageType:
         return np.dtype([self._column(f, sizes) for f in self.fields], align=True)
 
     def _column(self, field: Field, sizes: Mapping[str, int]) -> tuple[str, Any, tuple[int, ...]]:
+        """Return the entry of the numpy dtype for one field: name, type and shape."""
         kind = (
             field.kind.dtype(sizes) if isinstance(field.kind, MessageType) else np.dtype(field.kind)
         )

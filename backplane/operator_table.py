@@ -1,14 +1,14 @@
-"""The operator table: commands from outside, in shared memory, in the system controller's window.
+"""Table of commands from outside the rack, in the system controller's shared-memory window.
 
-Any process may add a request, at any time. Only the clock issues it, at the beginning of a tick: it
-publishes the message in the level's mailbox, whose only writer it is. All tasks of a tick therefore
-see the same commands, and a run in lockstep repeats with them. Here a command is only the bytes of
-a message; `levels` defines its meaning.
+Any process may add a request at any time. Only the clock issues it, at the beginning of a tick: it
+publishes the message in the level's mailbox, of which it is the only writer. All tasks of a tick
+therefore see the same commands, and a lockstep run repeats with the same commands. This module
+treats a command as the bytes of a message; `levels` defines the meaning.
 
-A request belongs to the run, or to a client that waits for it. The latter is withdrawn when the
-client's process ends, even if it is killed: the client holds a kernel lock, which the clock can
-check in a microsecond. With a lease the client stays after its command was issued, and the clock
-sees when it ends, or is not `heard` any more.
+A request belongs to the run or to a client that waits for it. A client's request is withdrawn when
+the client's process ends, even if it is killed. To show that it is alive, the client holds a kernel
+lock, which the clock can check in a microsecond. Under a lease the client keeps the lock after its
+command was issued, and the clock notices if the client ends or is no longer `heard`.
 """
 
 from __future__ import annotations
@@ -25,8 +25,10 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import System, Word
 
 _CLAIMS = 1 << 40
-"""Address of the byte that the client of ticket 0 locks: beyond any segment, since a lock needs no
-memory."""
+"""Address of the byte that the client of ticket 0 locks.
+
+It lies beyond any segment, because a lock needs no memory.
+"""
 
 
 class RequestStage(IntEnum):
@@ -47,8 +49,12 @@ class Client(IntEnum):
 
 @dataclass(frozen=True)
 class Request:
-    """A command to issue: the index of its mailbox, its message, and its tick (-1: as soon as
-    possible).
+    """Command to be issued.
+
+    Attributes:
+        mailbox: Index of the mailbox.
+        message: Bytes of the message.
+        tick: Tick at which it is issued, -1 for as soon as possible.
     """
 
     mailbox: int
@@ -57,17 +63,18 @@ class Request:
 
 
 class RequestEntry:
-    """One entry of the table: `words` and `message` are views of shared memory.
+    """Entry of the operator table. `words` and `message` are views of shared memory.
 
-    The host fills a free one; from then on the clock writes `stage`, `serial` and `given_tick`.
+    The host fills a free entry. After that the clock writes `stage`, `serial` and `given_tick`.
     """
 
     stage = Word(0)  # RequestStage
     ticket = Word(1)  # number of the request: it changes when the entry is filled again
     mailbox = Word(2)  # index among the layout's mailboxes
-    tick = Word(3)  # tick at which to issue it; -1: at once
-    serial = Word(4)  # of the command, rising over all levels in the order of issue; 0: not yet
-    given_tick = Word(5)  # -1: not yet
+    tick = Word(3)  # tick at which to issue it, -1 for at once
+    # Serial of the command, which rises over all levels in the order of issue. 0 before.
+    serial = Word(4)
+    given_tick = Word(5)  # tick at which it was issued, -1 before
     client = Word(6)  # Client
     heard = Word(7)  # tick at which the client of a lease was last heard
 
@@ -80,11 +87,11 @@ class RequestEntry:
 
     @property
     def is_leased(self) -> bool:
-        """Whether it was issued under a lease that is not released."""
+        """True if the command was issued under a lease that has not been released."""
         return self.client == Client.LEASES and self.stage == RequestStage.GIVEN
 
     def becomes(self, issued: Request) -> bool:
-        """Say whether this request may be the one that was issued so."""
+        """Check whether this request can become the given issued command."""
         return (
             self.mailbox == issued.mailbox
             and self.tick <= issued.tick
@@ -93,7 +100,7 @@ class RequestEntry:
 
 
 class OperatorTable:
-    """The table of one rack. `entries` holds all entries, free ones too."""
+    """Operator table of one rack. `entries` contains all entries, including free ones."""
 
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
@@ -101,25 +108,29 @@ class OperatorTable:
         self.entries = [RequestEntry(segment, index) for index in range(OPERATOR_ENTRIES)]
 
     def add(self, request: Request) -> RequestEntry:
-        """Fill a free entry, or that of the command issued longest ago; the clock issues it when it
-        is due.
+        """Fill a free entry, or reuse the entry of the command that was issued longest ago.
 
-        Raises `OperatorTableError` when all entries wait for their ticks.
+        The clock issues the command when it is due.
+
+        Raises:
+            OperatorTableError: All entries wait for their ticks.
         """
         with locked(self._segment.fd, self._segment.map.operator):
             return self._fill(request, Client.NONE)
 
     @contextmanager
     def claim(self, request: Request, client: Client = Client.WAITS) -> Iterator[RequestEntry]:
-        """Add a request as its client, and withdraw it at the end of the `with` block unless it has
-        been issued.
+        """Add a request on behalf of this process.
 
-        Raises `OperatorTableError` when all entries wait for their ticks.
+        At the end of the `with` block the request is withdrawn unless it has been issued.
+
+        Raises:
+            OperatorTableError: All entries wait for their ticks.
         """
         with ExitStack() as stack:
             with locked(self._segment.fd, self._segment.map.operator):
                 ticket = self._words[System.REQUESTED] + 1
-                # While the request waits, this shows that its client lives.
+                # This lock shows that the client is alive while the request waits.
                 lock = stack.enter_context(closing(ByteLock(self._segment.fd, _CLAIMS + ticket)))
                 lock.take()
                 entry = self._fill(request, client)
@@ -127,7 +138,7 @@ class OperatorTable:
             yield entry
 
     def withdraw(self, entry: RequestEntry, ticket: int) -> bool:
-        """Withdraw a request that still waits; False when it was issued."""
+        """Withdraw a request that is still waiting. Returns False if it was issued."""
         if entry.ticket != ticket or entry.stage != RequestStage.WAITING:
             return False
         entry.stage = RequestStage.FREE
@@ -135,54 +146,61 @@ class OperatorTable:
         return entry.given_tick < 0
 
     def is_waiting(self, entry: RequestEntry) -> bool:
-        """Say whether a request waits, and its client, if any, still lives."""
+        """Check whether a request is waiting and its client, if it has one, is alive."""
         if entry.stage != RequestStage.WAITING:
             return False
         return not entry.client or self.client_lives(entry)
 
     def client_lives(self, entry: RequestEntry) -> bool:
-        """Say whether the client of a request lives."""
+        """Check whether the client of a request is alive."""
         return self._segment.is_locked(_CLAIMS + entry.ticket)
 
     def leased(self) -> list[RequestEntry]:
-        """Return the requests that were issued under a lease, until it is released."""
+        """Return the requests that were issued under a lease that has not been released."""
         return [entry for entry in self.entries if entry.is_leased]
 
     def hear(self, entry: RequestEntry, ticket: int) -> bool:
-        """Note that the client of a lease is there; False when the lease was released."""
+        """Record that the client of a lease is alive. Returns False if the lease was released."""
         entry.heard = self._words[System.TICK]
         return entry.ticket == ticket and entry.client == Client.LEASES
 
     def release(self, entry: RequestEntry) -> None:
-        """End the lease of a request: what happens to its client does not matter any more."""
+        """Release the lease of a request. The end of its client then has no effect."""
         entry.client = Client.WAITS
 
     def waiting(self) -> list[RequestEntry]:
         """Return the waiting requests in the order in which they were added."""
-        found = [entry for entry in self.entries if self.is_waiting(entry)]
-        return sorted(found, key=lambda entry: entry.ticket)
+        entries = [entry for entry in self.entries if self.is_waiting(entry)]
+        return sorted(entries, key=lambda entry: entry.ticket)
 
     def lacking(self, requests: Sequence[Request]) -> list[Request]:
-        """Return those of a run's commands, given in the order of issue, that do not wait here
-        already: each entry is issued at its tick or, added late, after it.
+        """Return the commands of a run that are not waiting in the table.
+
+        Args:
+            requests: Commands of the run in the order of issue, each with the tick at which it
+                was issued. A command that was added late was issued after its requested tick.
         """
         waiting = sorted(self.waiting(), key=lambda entry: entry.tick)
-        found = []
-        for wanted in requests:
-            entry = next((entry for entry in waiting if entry.becomes(wanted)), None)
+        missing = []
+        for request in requests:
+            entry = next((entry for entry in waiting if entry.becomes(request)), None)
             if entry is None:
-                found.append(wanted)
+                missing.append(request)
             else:
                 waiting.remove(entry)
-        return found
+        return missing
 
     def _fill(self, request: Request, client: Client) -> RequestEntry:
-        """Fill an entry, while no other process fills one. Raises `OperatorTableError`."""
+        """Fill an entry. The caller holds the lock of the table.
+
+        Raises:
+            OperatorTableError: All entries wait for their ticks.
+        """
         settled = [e for e in self.entries if not self.is_waiting(e) and not e.is_leased]
         if not settled:
             why = f"{len(self.entries)} commands wait for their ticks"
             raise OperatorTableError(
-                f"the operator table is full: {why}; permitted: once one of them is given"
+                f"the operator table is full: {why}; try again once one of them has been issued"
             )
         entry = min(settled, key=lambda e: (e.stage, e.serial))
         entry.stage = RequestStage.FREE
@@ -194,7 +212,7 @@ class OperatorTable:
         entry.given_tick = -1
         entry.heard = -1
         entry.message[: len(request.message)] = request.message
-        # From here the clock may issue it.
+        # From now on the clock may issue the command.
         entry.stage = RequestStage.WAITING
         self._words[System.REQUESTED] += 1
         return entry

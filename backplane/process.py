@@ -1,4 +1,4 @@
-"""Processes: alive or not, on which core, at which priority."""
+"""State, core, priority and memory of processes, from the kernel."""
 
 from __future__ import annotations
 
@@ -27,50 +27,60 @@ STOPPED = "Tt"
 
 
 def start_time(pid: int) -> int:
-    """Return the start time of a process, in kernel clock ticks since boot; 0 when there is none or
-    it is a zombie.
+    """Return the start time of a process, in kernel clock ticks since boot.
+
+    The result is 0 if the process does not exist or is a zombie.
     """
     fields = _stat(pid)
     return int(fields[19]) if fields and fields[0] not in GONE else 0
 
 
 def state_of(pid: int) -> str:
-    """Return the kernel's letter for a process's state: R, S, D, T (stopped), Z (dead, not reaped);
-    X: no process.
+    """Return the kernel's letter for the state of a process.
+
+    It is R, S, D, T (stopped) or Z (dead, not reaped), and X if the process does not exist.
     """
     return (_stat(pid) or "X")[0]
 
 
 def processor_ns(pid: int) -> int:
-    """Return the processor time used by a process so far, in ns, to about 10 ms; 0 when there is
-    none.
+    """Return the processor time used by a process, in ns, to about 10 ms.
+
+    The result is 0 if the process does not exist.
     """
     fields = _stat(pid)
     return (int(fields[11]) + int(fields[12])) * (1_000_000_000 // _TICKS_A_SECOND) if fields else 0
 
 
 def _stat(pid: int) -> list[str]:
+    """Return the fields of /proc/<pid>/stat after the command name, empty if there is none."""
     try:
         stat = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
     except (FileNotFoundError, ProcessLookupError):
         return []
-    # The command name, in parentheses, may itself hold spaces and parentheses.
+    # The command name, in parentheses, may contain spaces and parentheses.
     return stat.rpartition(")")[2].split()
 
 
 def is_alive(pid: int, started: int = 0) -> bool:
-    """Say whether a process is alive; with `started`, whether it is still the same process, since
-    pids are reused.
+    """Check whether a process is alive.
+
+    Args:
+        pid: Process id.
+        started: Start time of the expected process, because pids are reused. 0 accepts any
+            process.
     """
-    found = start_time(pid) if pid > 0 else 0
-    return bool(found) and started in (0, found)
+    start = start_time(pid) if pid > 0 else 0
+    return bool(start) and started in (0, start)
 
 
 def readable(fd: int, timeout_s: float) -> bool:
-    """Wait until a descriptor can be read, or the process of a pidfd has ended; False after the
-    timeout.
+    """Wait until a descriptor is readable, or the process of a pidfd has ended.
 
-    Unlike `select` this takes descriptors above 1023.
+    Unlike `select`, this accepts descriptors above 1023.
+
+    Returns:
+        False if the timeout has passed.
     """
     waiting = select.poll()
     waiting.register(fd, select.POLLIN)
@@ -78,20 +88,25 @@ def readable(fd: int, timeout_s: float) -> bool:
 
 
 def compute_until(processor_time_ns: int) -> None:
-    """Compute until the calling process has used that much processor time (`process_time_ns`:
-    without preemption).
+    """Busy-loop until the calling process has used this much processor time.
+
+    The time is measured by `process_time_ns`, which excludes preemption.
     """
     while process_time_ns() < processor_time_ns:
         pass
 
 
 def pin(core: int) -> None:
-    """Pin the calling process to one core. Raises `OSError` when the machine lacks it."""
+    """Pin the calling process to one core.
+
+    Raises:
+        OSError: The machine does not have this core.
+    """
     os.sched_setaffinity(0, {core})
 
 
 LATENCY_REQUEST = Path("/dev/cpu_dma_latency")
-"""Device that takes the longest permitted wake-up time of a core, us, while it is open."""
+"""Device that limits the wake-up time of cores, in us, while it is open."""
 _PR_SET_NAME = 15
 _PR_SET_PDEATHSIG = 1
 _PR_SET_TIMERSLACK = 29
@@ -100,31 +115,44 @@ _libc = ctypes.CDLL(None, use_errno=True)
 
 
 DEADLINE = 100
-"""Stands for SCHED_DEADLINE among SCHED_FIFO's priorities, which end at 99: it precedes all."""
+"""Value that stands for SCHED_DEADLINE among the priorities of SCHED_FIFO.
+
+It is above all of them, which end at 99.
+"""
 SCHED_DEADLINE = 6
 _RESET_ON_FORK = 1
 _RECLAIM = 2
-"""Lets a process that exceeds its reservation use what others leave: a first cycle takes longer."""
+"""Flag that lets a process exceed its reservation with time that others leave unused.
+
+A first cycle takes longer than the later ones.
+"""
 _SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}
-"""Number of the system call, by machine: the C library has no function for it."""
+"""System call number by machine, since the C library has no function for it."""
 
 
 class Reservation(NamedTuple):
-    """Processor time under SCHED_DEADLINE: so much in each period, before its end."""
+    """Processor time under SCHED_DEADLINE: `runtime_ns` within each period of `period_ns`."""
 
     runtime_ns: int
     period_ns: int
 
 
 def take_core(core: int, priority: int, reservation: Reservation | None = None) -> int:
-    """Pin the calling process to a core and, if allowed, a reservation or else a priority.
+    """Pin the calling process to a core and raise its priority, if allowed.
 
-    Return the SCHED_FIFO priority obtained; 0: ordinary scheduling; `DEADLINE`: the reservation.
+    Args:
+        core: Processor core.
+        priority: SCHED_FIFO priority, used if there is no reservation or the system refuses it.
+        reservation: Processor time to reserve under SCHED_DEADLINE.
+
+    Returns:
+        The SCHED_FIFO priority obtained, `DEADLINE` for the reservation, or 0 for ordinary
+            scheduling.
     """
     everywhere = os.sched_getaffinity(0)
     pin(core)
     if reservation is not None:
-        # A pinned process is admitted only where the kernel does not add up what is reserved.
+        # A pinned process is admitted only if the kernel does not add up reservations.
         for cores in ({core}, everywhere):
             os.sched_setaffinity(0, cores)
             if _reserve(reservation):
@@ -134,31 +162,32 @@ def take_core(core: int, priority: int, reservation: Reservation | None = None) 
 
 
 def _reserve(reservation: Reservation) -> bool:
-    """Take SCHED_DEADLINE; False when the system refuses it."""
+    """Switch to SCHED_DEADLINE. Returns False if the system refuses."""
     runtime_ns, period_ns = reservation
     times = runtime_ns, period_ns, period_ns
     record = Struct("=IIQiIQQQ")
-    wanted = record.pack(record.size, SCHED_DEADLINE, _RESET_ON_FORK | _RECLAIM, 0, 0, *times)
+    attributes = record.pack(record.size, SCHED_DEADLINE, _RESET_ON_FORK | _RECLAIM, 0, 0, *times)
     number = _SCHED_SETATTR.get(platform.machine())
-    return number is not None and _libc.syscall(number, 0, wanted, 0) == 0
+    return number is not None and _libc.syscall(number, 0, attributes, 0) == 0
 
 
 def wake_up_exactly() -> None:
-    """Let the calling process, if it is an ordinary one, sleep as long as it wants and no longer:
-    to save power, the system wakes such processes up to 50 us late.
+    """Let the calling process sleep without the kernel's timer slack.
+
+    To save power, the kernel wakes ordinary processes up to 50 us late.
     """
     _libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
 
 
 @contextmanager
 def cores_kept_awake() -> Iterator[str]:
-    """Keep every core from sleeping while it is idle; yield why the system refuses that, empty if
-    it permits it.
+    """Keep idle cores from sleeping. Yields why the system refuses, or an empty text.
 
-    A core that sleeps takes 20 us and more to wake up. But one that is held awake spins: a host
-    that gives a virtual machine a quota of processor time counts that, and takes the core away for
-    ms once the quota is used up. As a rule the system permits it to root only. The request ends
-    with the process, however that ends: https://docs.kernel.org/power/pm_qos_interface.html
+    A sleeping core takes 20 us or more to wake up. A core that is kept awake spins. If a host gives
+    a virtual machine a quota of processor time, spinning counts against it, and the host takes the
+    core away for milliseconds once the quota is used up. As a rule only root may make the request.
+    It ends with the process, however the process ends:
+    https://docs.kernel.org/power/pm_qos_interface.html
     """
     refusal = ""
     with ExitStack() as stack:
@@ -166,38 +195,42 @@ def cores_kept_awake() -> Iterator[str]:
             stack.enter_context(LATENCY_REQUEST.open("r+b", 0)).write(bytes(4))
         except OSError as error:
             refusal = (
-                f"idle cores sleep, since {LATENCY_REQUEST} cannot be opened: {error.strerror}"
+                f"idle cores sleep, because {LATENCY_REQUEST} cannot be opened: {error.strerror}"
             )
         yield refusal
 
 
 def mapped_and_locked(pid: int) -> tuple[int, int]:
-    """Return the bytes of memory that a process has mapped, and those locked; 0 when there is no
-    process.
+    """Return how many bytes a process has mapped and how many are locked.
+
+    Both are 0 if the process does not exist.
     """
-    found: list[str] = []
+    sizes_kib: list[str] = []
     with suppress(FileNotFoundError, ProcessLookupError):
-        found = re.findall(r"Vm(?:Size|Lck):\s*(\d+)", Path(f"/proc/{pid}/status").read_text())
-    mapped, locked = (int(kib) << 10 for kib in found or "00")
+        sizes_kib = re.findall(r"Vm(?:Size|Lck):\s*(\d+)", Path(f"/proc/{pid}/status").read_text())
+    mapped, locked = (int(kib) << 10 for kib in sizes_kib or "00")
     return mapped, locked
 
 
 def refusal(error: OSError) -> str:
-    """Return why the system refused a process or a file, with the limit that is reached."""
+    """Explain why the system refused a process or a file, with the limit that was reached."""
     limits = {
         errno.EAGAIN: ("processes", "u", RLIMIT_NPROC),
         errno.EMFILE: ("open files", "n", RLIMIT_NOFILE),
     }
     if error.errno not in limits:
         return str(error)
-    what, option, limit = limits[error.errno]
-    return (
-        f"{error.strerror}: at most {getrlimit(limit)[0]} {what} are permitted (ulimit -{option})"
-    )
+    resource, option, limit = limits[error.errno]
+    most = getrlimit(limit)[0]
+    return f"{error.strerror}: the limit is {most} {resource} (ulimit -{option})"
 
 
 def set_priority(priority: int) -> bool:
-    """Take a SCHED_FIFO priority, 0 for ordinary scheduling; False when the system refuses it."""
+    """Switch to a SCHED_FIFO priority, or to ordinary scheduling for 0.
+
+    Returns:
+        False if the system refuses.
+    """
     policy = os.SCHED_FIFO if priority else os.SCHED_OTHER
     try:
         os.sched_setscheduler(0, policy, os.sched_param(priority))
@@ -207,11 +240,11 @@ def set_priority(priority: int) -> bool:
 
 
 COPY = "copy:"
-"""Begins the names of processes that are part of a snapshot."""
+"""Prefix of the names of processes that belong to a snapshot."""
 
 
 def name_process(name: str) -> None:
-    """Set the name of the calling process in `top` and `ps`, 15 characters."""
+    """Set the name of the calling process in `top` and `ps`, at most 15 characters."""
     _libc.prctl(_PR_SET_NAME, name.encode()[:15], 0, 0, 0)
 
 
@@ -224,16 +257,16 @@ def die_with_parent(parent: int) -> None:
 
 
 def adopt_orphans() -> None:
-    """Become the parent of descendants whose own parents have ended, whatever their sessions."""
+    """Become the parent of descendants whose parents have ended, whatever their sessions."""
     _libc.prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
 
 
 def how_ended(status: int) -> str:
-    """Return how a process ended, by its exit status; those below 0 stand for signals."""
+    """Describe how a process ended. A negative exit status stands for a signal."""
     return f"signal {signal.Signals(-status).name}" if status < 0 else f"exit status {status}"
 
 
 def children_of(parent: int) -> set[int]:
-    """Return the children of a process, those that have ended and are not reaped included."""
+    """Return the children of a process, including zombies that are not reaped."""
     pids = [int(entry.name) for entry in Path("/proc").glob("[0-9]*")]
     return {pid for pid in pids if _stat(pid)[1:2] == [str(parent)]}

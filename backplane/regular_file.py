@@ -1,7 +1,7 @@
-"""Reading regular files of bounded size.
+"""Reader of regular files of bounded size.
 
-Files that a user or another program names may be FIFOs, which block whoever opens them, devices,
-which act or never end, or too large for memory.
+A path that a user or another program names may lead to a FIFO, which blocks the process that opens
+it, to a device, which acts or never ends, or to a file that is too large for memory.
 """
 
 from __future__ import annotations
@@ -22,8 +22,9 @@ _KINDS = {
 
 
 class RefusedFileError(OSError):
-    """A file that is not a regular file, or is too large; `strerror` is the reason as a
-    sentence.
+    """Raised for a file that is not a regular file or is too large.
+
+    `strerror` states the reason as a sentence.
     """
 
     def __str__(self) -> str:
@@ -34,22 +35,22 @@ def read_regular_file(path: Path, limit_bytes: int) -> bytes:
     """Return the content of a regular file, without ever waiting for a writer.
 
     Args:
-        path: File to read; symbolic links are followed.
+        path: File to read. Symbolic links are followed.
         limit_bytes: Largest permitted size.
 
     Raises:
-        RefusedFileError: The file is no regular file, or is larger than permitted.
+        RefusedFileError: The file is not a regular file, or it is too large.
         OSError: The file cannot be opened or read, as by `open`.
     """
     # Opening a device may already act on it, so its kind is checked first. The kind is checked
-    # again once the file is open, because the path may name another file by then.
+    # again once the file is open, because the path may name another file by that time.
     check_regular_file(path, limit_bytes)
     flags = os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
     with os.fdopen(os.open(path, flags), "rb") as file:
         _check(path, os.fstat(file.fileno()), limit_bytes)
         pieces = []
         size = 0
-        # Files of /proc and files that are being written hold more bytes than their size says.
+        # Files of /proc and files that are being written may contain more bytes than their size.
         while piece := file.read(PIECE_BYTES):
             pieces.append(piece)
             size += len(piece)
@@ -58,20 +59,21 @@ def read_regular_file(path: Path, limit_bytes: int) -> bytes:
 
 
 def check_regular_file(path: Path, limit_bytes: int) -> None:
-    """Check a file that a library opens by its path.
+    """Check the kind and size of a file that a library opens by its path.
 
     Args:
-        path: File to check; symbolic links are followed.
+        path: File to check. Symbolic links are followed.
         limit_bytes: Largest permitted size.
 
     Raises:
-        RefusedFileError: The file is no regular file, or is larger than permitted.
-        OSError: There is no such file, or its folder cannot be searched.
+        RefusedFileError: The file is not a regular file, or it is too large.
+        OSError: The file does not exist, or its folder cannot be searched.
     """
     _check(path, path.stat(), limit_bytes)
 
 
 def _check(path: Path, status: os.stat_result, limit_bytes: int) -> None:
+    """Raise `RefusedFileError` unless a status describes a regular file within the limit."""
     if not stat.S_ISREG(status.st_mode):
         kind = _KINDS[stat.S_IFMT(status.st_mode)]
         raise RefusedFileError(errno.EINVAL, f"not a regular file, but a {kind}", str(path))
@@ -79,6 +81,7 @@ def _check(path: Path, status: os.stat_result, limit_bytes: int) -> None:
 
 
 def _check_size(path: Path, size: int, limit_bytes: int) -> None:
+    """Raise `RefusedFileError` if a file is larger than the limit."""
     if size > limit_bytes:
-        reason = f"too large, {size} bytes; permitted: {limit_bytes}"
+        reason = f"too large: {size} bytes; the limit is {limit_bytes}"
         raise RefusedFileError(errno.EFBIG, reason, str(path))

@@ -1,4 +1,4 @@
-"""Reading a ring in blocks, for the host side: it never slows the writer down."""
+"""Reader of ring buffers in blocks, for the host side. It never slows the writer down."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ from rack.backplane.address_map import oldest_kept
 from rack.backplane.errors import DamageError
 
 MOST = 1 << 48
-"""No ring is written so often."""
+"""Upper bound of a valid record count. No ring is written this often."""
 
 
 class Drained(NamedTuple):
-    """Rows read from a ring, oldest first, and the number of rows overwritten before they were
-    read.
+    """Rows read from a ring, oldest first, and the number of rows lost.
+
+    A lost row was overwritten before it was read.
     """
 
     rows: np.ndarray
@@ -23,16 +24,20 @@ class Drained(NamedTuple):
 
 
 class Ring:
-    """A ring of fixed records that another process writes; `head` holds the number of records
-    written.
+    """Ring buffer of fixed-size records that another process writes.
 
-    The first `before` records were written in a run that this one continues: they are not read.
+    Args:
+        memory: Memory of the records.
+        dtype: Type of a record.
+        head: Word with the number of records written.
+        before: Number of records written in an earlier run, which this run continues. They are
+            not read.
     """
 
     def __init__(
         self, memory: memoryview, dtype: np.dtype, head: memoryview, before: int = 0
     ) -> None:
-        # As plain bytes: copying by field would skip the padding, and checksums would not match.
+        # Copy plain bytes. A copy by field would skip the padding, and checksums would not match.
         self._rows = np.frombuffer(memory, dtype=f"V{dtype.itemsize}")
         self._dtype = dtype
         self._head = head
@@ -41,14 +46,18 @@ class Ring:
 
     @property
     def waiting(self) -> int:
-        """Records written and not yet read."""
+        """Number of records written and not yet read."""
         return self._written - self._taken
 
     @property
     def _written(self) -> int:
-        """Records written so far. Raises `DamageError` for an impossible number."""
+        """Number of records written.
+
+        Raises:
+            DamageError: The number is impossible.
+        """
         if not 0 <= (count := self._head[0]) < MOST:
-            raise DamageError(f"a ring of {count} records")
+            raise DamageError(f"a ring cannot have {count} records")
         return count
 
     def resume(self, taken: int) -> None:
@@ -60,7 +69,7 @@ class Ring:
         head = self._written
         first = max(self._taken + 1, head - self._depth + 1)
         rows = self._rows[np.arange(first, head + 1) % self._depth].view(self._dtype)
-        # Rows that the writer reached during the copy.
+        # The writer may have overwritten the oldest rows during the copy.
         torn = max(0, oldest_kept(self._written, self._depth) - first)
         lost = first - self._taken - 1 + min(torn, len(rows))
         self._taken = head

@@ -1,8 +1,8 @@
 """The backplane's memory: one POSIX shared-memory segment per rack.
 
-The Rack makes and unlinks it. All others attach by the rack's name and find the layout and the
-resolved config in the segment itself. It gets its name only when it is complete: a launcher killed
-earlier leaves nothing in /dev/shm, and no process ever finds half a segment.
+The Rack creates and unlinks it. All other processes attach by the rack's name and find the layout
+and the resolved config in the segment itself. The segment gets its name only when it is complete,
+so a launcher killed earlier leaves nothing in /dev/shm, and no process finds half a segment.
 """
 
 from __future__ import annotations
@@ -35,39 +35,47 @@ if TYPE_CHECKING:
 MAGIC = int.from_bytes(b"NASREM-1", "little")
 VERSION = 18
 TEXTS = (Head.LAYOUT_AT, Head.CONFIG_AT, Head.PUBLISHED_AT)
-"""Words with the addresses of the texts; the word after each has its size."""
+"""Words with the addresses of the texts. The word after each of them contains the size."""
 PREFIX = "nasrem-rack."
 SHM_FOLDER = Path("/dev/shm")
-"""Folder in which `shm_open` of the C library keeps its names."""
+"""Folder in which the C library's `shm_open` keeps its names."""
 LOOK_S = 0.02
-"""Time between two looks at the lock of a launcher that is to end."""
+"""Time between two checks of the lock of a launcher that is about to end."""
 _LIFE = 8 * Head.LAUNCHER_PID
 """Bus address on which the launcher holds a lock for as long as it lives."""
 PROCESSOR = "x86_64"
-"""Stores become visible to other cores in program order: rings and control blocks need that, and
-mailboxes where Python accesses them (see `rack.backplane.mailbox.slots`). Nobody has run a rack
-elsewhere."""
+"""Processor architecture on which stores become visible to other cores in program order.
+
+Rings and control blocks need this order, and so do mailboxes where Python accesses them (see
+`rack.backplane.mailbox.slots`). Racks have not been tested on other architectures.
+"""
 TRY = "RACK_TRY_PROCESSOR"
-"""Environment variable that has a rack tried on other processors with 64 bits."""
+"""Environment variable that permits other processors with 64 bits, for a trial."""
 
 
 class Launch(NamedTuple):
-    """When a segment was made, ns: on the wall clock, and on CLOCK_MONOTONIC of its machine."""
+    """Time at which a segment was created, in ns: wall clock and CLOCK_MONOTONIC."""
 
     created_ns: int
     monotonic_ns: int
 
     @property
     def wall_offset_ns(self) -> int:
-        """Wall clock less CLOCK_MONOTONIC: one for the whole run, as the wall clock may be set
-        meanwhile.
+        """Wall clock minus CLOCK_MONOTONIC, in ns.
+
+        The offset is fixed for the whole run, because the wall clock may be set during the run.
         """
         return self.created_ns - self.monotonic_ns
 
 
 class CycleCounts(NamedTuple):
-    """Cycles of a task: plans or cycles missed, cycles skipped, and all that were due. A plan takes
-    `plan` cycles.
+    """Cycles of a task.
+
+    Attributes:
+        missed: Plans or cycles that missed their deadline.
+        skipped: Cycles skipped.
+        due: All cycles that were due.
+        plan: Cycles that one plan may take.
     """
 
     missed: int
@@ -77,18 +85,28 @@ class CycleCounts(NamedTuple):
 
     @property
     def lost(self) -> int:
-        """The cycles missed or skipped; a plan may have ended after the last cycle due."""
+        """Number of cycles missed or skipped.
+
+        It is at most `due`, because a plan may have ended after the last cycle due.
+        """
         return min(self.due, self.missed * self.plan + self.skipped)
 
     def __str__(self) -> str:
-        """Return what was lost, as readable text."""
+        """Return the counts as readable text."""
         unit = f" plans of {self.plan} cycles" * (self.plan > 1)
         return f"missed {self.missed}{unit} and skipped {self.skipped} of its {self.due} cycles"
 
 
 class Segment:
-    """An attached segment: `layout`, `config` (TOML text), `published` (JSON text: the facts about
-    its levels), `map`, and its memory as `words` and `bytes`.
+    """An attached segment.
+
+    Attributes:
+        layout: Mailboxes and tasks.
+        config: The resolved config, as TOML.
+        published: Facts about the levels, as JSON.
+        map: Bus addresses.
+        words: The memory as 64-bit integers.
+        bytes: The memory as bytes.
     """
 
     def __init__(self, rack: str, memory: mmap.mmap, fd: int = -1) -> None:
@@ -98,8 +116,10 @@ class Segment:
         self.bytes = memoryview(memory)
         self.words = self.bytes.cast("q")
         self.message_classes: dict[str, type[Message]] = {}
-        """Classes of the messages that this process reads and writes, by mailbox: see
-        `AnyMessage` for others."""
+        """Message classes that this process reads and writes, by mailbox.
+
+        `AnyMessage` is used for the other mailboxes.
+        """
         self.layout: Layout
         self.config: str
         self.published: str
@@ -107,7 +127,7 @@ class Segment:
 
     @classmethod
     def create(cls, layout: Layout, config: str, published: str = "{}") -> Self:
-        """Make the segment of a rack, mode 0600, all of it allocated.
+        """Create the segment of a rack with mode 0600, fully allocated.
 
         Args:
             layout: Layout of the backplane.
@@ -115,16 +135,17 @@ class Segment:
             published: Facts about the levels, as JSON.
 
         Raises:
-            SegmentError: The name is in use, memory is short, or the processor is another.
+            SegmentError: The name is in use, memory is short, or the processor is not
+                supported.
         """
         if (machine := os.uname().machine) != PROCESSOR:
             here = f"rack '{layout.rack}': the processor here is {machine}"
             if sys.maxsize < 1 << 32:
                 raise SegmentError(f"{here}, without atomic access to 64 bits")
-            why = f"the backplane's memory order is argued for {PROCESSOR} alone"
+            why = f"the backplane's memory order is proved for {PROCESSOR} alone"
             if not os.environ.get(TRY):
-                raise SegmentError(f"{here}; {why}; {TRY}=1 tries it all the same")
-            sys.stderr.write(f"{here}; {why}: nobody has tested this\n")
+                raise SegmentError(f"{here}; {why}; set {TRY}=1 to try it")
+            sys.stderr.write(f"{here}; {why}, and this one is untested\n")
         texts = [encode_json(asdict(layout)).encode(), config.encode(), published.encode()]
         places = AddressMap(layout)
         size = pages(places.size + sum(len(t) for t in texts))
@@ -134,7 +155,7 @@ class Segment:
         except OSError as error:
             raise SegmentError(f"rack '{layout.rack}': {SHM_FOLDER}: {error.strerror}") from None
         try:
-            # Otherwise a full /dev/shm would raise SIGBUS at the first access to a page.
+            # Without this, a full /dev/shm would raise SIGBUS at the first access to a page.
             os.posix_fallocate(fd, 0, size)
             segment = cls(layout.rack, mmap.mmap(fd, size), fd)
             segment.layout = layout
@@ -143,7 +164,8 @@ class Segment:
             segment.map = places
             segment._fill_head(texts)
             segment._life = life
-            # Before it has a name: nobody ever finds the segment of a live rack without this lock.
+            # Take the lock before the segment has a name, so that no process ever finds the segment
+            # of a live rack without it.
             life.take()
             # With a descriptor, which absolute paths do not need, the link leads to the file, not
             # to its path in /proc.
@@ -153,22 +175,27 @@ class Segment:
             life.close()
             if isinstance(error, FileExistsError):
                 why = (
-                    "already has a segment: it is running, or was killed; see 'rack list', 'rack"
-                    " clean'"
+                    "already has a segment: it is running, or was killed; see 'rack list' and"
+                    " 'rack clean'"
                 )
                 raise SegmentError(f"rack '{layout.rack}' {why}") from None
-            found = os.statvfs(SHM_FOLDER)
-            whole, free = (count * found.f_frsize for count in (found.f_blocks, found.f_bavail))
-            room = (
-                f"{SHM_FOLDER} has {whole} bytes, {free} of them free; in a container --shm-size"
-                " enlarges it"
+            file_system = os.statvfs(SHM_FOLDER)
+            whole, free = (
+                count * file_system.f_frsize
+                for count in (file_system.f_blocks, file_system.f_bavail)
+            )
+            space_text = (
+                f"{SHM_FOLDER} has {whole} bytes, {free} of them free; for a container, --shm-size"
+                " sets its size"
             )
             raise SegmentError(
-                f"rack '{layout.rack}': {size} bytes of shared memory: {error.strerror}: {room}"
+                f"rack '{layout.rack}': {size} bytes of shared memory: {error.strerror}:"
+                f" {space_text}"
             ) from None
         return segment
 
     def _fill_head(self, texts: list[bytes]) -> None:
+        """Fill the head, the texts and the initial words of a new segment."""
         address = self.map.size
         self.words[Head.CHECK] = crc32(b"".join(texts))
         for at, text in zip(TEXTS, texts, strict=True):
@@ -188,11 +215,11 @@ class Segment:
         self.words[Head.LAUNCHER_NAMESPACE] = _pid_namespace()
         self.words[Head.CREATED_NS] = time.time_ns()
         self.words[Head.CREATED_MONOTONIC_NS] = time.monotonic_ns()
-        # Last, so that no process attaches to half a segment.
+        # This is stored last, so that no process attaches to half a segment.
         self.words[Head.MAGIC] = MAGIC
 
     def initialize_semaphores(self) -> None:
-        """Make the semaphores, on which no process may wait."""
+        """Initialize all semaphores. No process may be waiting on them."""
         places = self.map
         initialize(
             self.bytes, (*places.wake.values(), *places.done.values()), places.locks.values()
@@ -202,7 +229,8 @@ class Segment:
     def attach(cls, rack: str) -> Self:
         """Attach to a rack's segment.
 
-        Raises `SegmentError` when there is none, or its owner, size or version is wrong.
+        Raises:
+            SegmentError: There is no such segment, or its owner, size or version is wrong.
         """
         segment = cls.open(rack)
         try:
@@ -214,10 +242,13 @@ class Segment:
 
     @classmethod
     def open(cls, rack: str) -> Self:
-        """Open a rack's segment of any version: the launcher is read from its head, the layout is
-        not read.
+        """Open a rack's segment of any version without reading its layout.
 
-        Raises `SegmentError` when there is none, or it is another user's, or not a segment.
+        The launcher can be read from its head.
+
+        Raises:
+            SegmentError: There is no such segment, it belongs to another user, or it is not a
+                segment.
         """
         if (kind := stranger(rack)) is not None:
             raise SegmentError(f"rack '{rack}': {shm_path(rack)} is a {kind}, not a segment")
@@ -232,16 +263,18 @@ class Segment:
             raise SegmentError(
                 f"rack '{rack}' {why}; racks: {', '.join(racks()) or 'none'}"
             ) from None
-        found = os.fstat(shm.fd)
-        if os.getuid() not in (found.st_uid, 0) or found.st_size < HEAD_SIZE:
+        status = os.fstat(shm.fd)
+        if os.getuid() not in (status.st_uid, 0) or status.st_size < HEAD_SIZE:
             os.close(shm.fd)
-            why = f"owner {found.st_uid}, {found.st_size} bytes: not a segment of this user's"
+            why = f"owner {status.st_uid}, {status.st_size} bytes: not a segment of this user"
             raise SegmentError(f"rack '{rack}': {why}")
-        return cls(rack, mmap.mmap(shm.fd, found.st_size), shm.fd)
+        return cls(rack, mmap.mmap(shm.fd, status.st_size), shm.fd)
 
     def read_head(self) -> None:
-        """Read the texts. Raises `SegmentError` when size or version is wrong, or a text is
-        damaged.
+        """Read the texts of the segment.
+
+        Raises:
+            SegmentError: Size or version is wrong, or a text is damaged.
         """
         if self.words[Head.MAGIC] != MAGIC or self.words[Head.VERSION] != VERSION:
             raise SegmentError(
@@ -250,7 +283,7 @@ class Segment:
             )
         if self.words[Head.SIZE] != len(self.bytes):
             raise SegmentError(
-                f"rack '{self.rack}': {len(self.bytes)} bytes; its head says"
+                f"rack '{self.rack}': the segment has {len(self.bytes)} bytes, but its head says"
                 f" {self.words[Head.SIZE]}"
             )
         try:
@@ -262,10 +295,10 @@ class Segment:
             self.layout = layout_of(json.loads(layout))
             self.map = AddressMap(self.layout)
             if self.map.size != self.words[Head.LAYOUT_AT]:
-                raise ValueError(f"a layout of {self.map.size} bytes")
+                raise ValueError(f"the layout cannot have {self.map.size} bytes")
         except (TypeError, LookupError, ValueError, AttributeError, RecursionError) as error:
             raise SegmentError(
-                f"rack '{self.rack}': layout unreadable, damaged or from another program: {error}"
+                f"rack '{self.rack}': the layout is damaged or from another program: {error}"
             ) from None
 
     def view(self, address: int, size: int) -> memoryview:
@@ -273,13 +306,18 @@ class Segment:
         return self.bytes[address : address + size]
 
     def block(self, task: str) -> memoryview:
-        """Return a task's control block, as words (`words.Block`). Raises `KeyError`."""
+        """Return a task's control block as words (`words.Block`).
+
+        Raises:
+            KeyError: There is no such task.
+        """
         start = self.map.blocks[task] // 8
         return self.words[start : start + BLOCK_SIZE // 8]
 
     def count_cycles(self, task: TaskSpec, tick: int) -> CycleCounts:
-        """Count the cycles of a task by `tick`. Releases since its last cycle are skipped ones as
-        soon as their time is over.
+        """Count the cycles of a task by `tick`.
+
+        Releases after its last cycle count as skipped once their time is over.
         """
         block = self.block(task.name)
         skipped = block[Block.SKIPPED] + task.count_unfinished(block[Block.DONE], tick)
@@ -288,25 +326,32 @@ class Segment:
         )
 
     def box(self, mailbox: str) -> memoryview:
-        """Return the head of a mailbox, as words (`words.Box`). Raises `KeyError`."""
+        """Return the head of a mailbox as words (`words.Box`).
+
+        Raises:
+            KeyError: There is no such mailbox.
+        """
         start = self.map.mailboxes[mailbox] // 8
         return self.words[start : start + MAILBOX_HEAD_SIZE // 8]
 
     def is_locked(self, address: int) -> bool:
-        """Say whether a process holds the lock on the byte at a bus address: see
-        `rack.backplane.byte_lock`.
+        """Check whether a process holds the lock on the byte at a bus address.
+
+        See `rack.backplane.byte_lock`.
         """
         return is_locked(self.fd, address)
 
     @property
     def launch(self) -> Launch:
-        """When it was made."""
+        """Time at which the segment was created."""
         return Launch(self.words[Head.CREATED_NS], self.words[Head.CREATED_MONOTONIC_NS])
 
     @property
     def launcher(self) -> int:
-        """Process id of the program that made the segment; 0 if that has another PID namespace than
-        this process, as in another container: there the number means another process.
+        """Process id of the program that created the segment.
+
+        It is 0 if that program has another PID namespace, as in another container. The number would
+        refer to a different process in this namespace.
         """
         words = self.words
         is_here = words[Head.LAUNCHER_NAMESPACE] == _pid_namespace()
@@ -314,16 +359,16 @@ class Segment:
 
     @property
     def launcher_text(self) -> str:
-        """The launcher for messages, as in "process 12"."""
+        """Launcher for messages, such as "process 12"."""
         return f"process {self.launcher}" if self.launcher else "a process of another PID namespace"
 
     @property
     def launcher_is_alive(self) -> bool:
-        """Whether the process that made the segment still runs."""
+        """True if the process that created the segment is still running."""
         return is_locked(self.fd, _LIFE)
 
     def await_launcher(self, timeout_s: float) -> bool:
-        """Wait until the launcher has ended or closed the rack; return False after the timeout."""
+        """Wait until the launcher has ended or closed the rack. Returns False on timeout."""
         deadline = time.monotonic() + timeout_s
         while self.launcher_is_alive:
             if time.monotonic() >= deadline:
@@ -333,13 +378,14 @@ class Segment:
 
     @property
     def run_is_over(self) -> bool:
-        """Whether the run has ended, in order or with its launcher."""
+        """True if the run has ended regularly or its launcher has ended."""
         return self.words[System.STATE] == Run.STOPPED or not self.launcher_is_alive
 
     @property
     def has_its_name(self) -> bool:
-        """Whether the rack's name still leads to this segment: another launch may have replaced
-        it.
+        """True if the rack's name still leads to this segment.
+
+        Another launch may have replaced it.
         """
         try:
             named = shm_path(self.rack).stat()
@@ -348,13 +394,14 @@ class Segment:
         return os.path.samestat(named, os.fstat(self.fd))
 
     def release(self) -> None:
-        """Release the launcher's lock: the rack then counts as dead."""
+        """Release the launcher's lock. The rack then counts as dead."""
         if self._life is not None:
             self._life.close()
 
     def close(self) -> None:
-        """Close the file descriptor; the mapping lasts as long as views of it. A launcher counts as
-        ended then.
+        """Close the file descriptor, and release the launcher's lock.
+
+        The mapping lasts as long as there are views of it.
         """
         self.release()
         if self.fd >= 0:
@@ -363,13 +410,14 @@ class Segment:
 
 
 def racks() -> list[str]:
-    """Return the names of the racks that have a segment, whether they run or not."""
+    """Return the names of the racks that have a segment, whether they are running or not."""
     return sorted(path.name.removeprefix(PREFIX) for path in SHM_FOLDER.glob(f"{PREFIX}*"))
 
 
 def stranger(rack: str) -> str | None:
-    """Return the kind of a foreign entry under a rack's name, as in "directory"; None for a file,
-    or no entry.
+    """Return the kind of a foreign entry under a rack's name, such as "directory".
+
+    The result is None for a regular file, or if there is no entry.
     """
     try:
         mode = shm_path(rack).lstat().st_mode
@@ -380,9 +428,10 @@ def stranger(rack: str) -> str | None:
 
 
 def unlink(rack: str) -> None:
-    """Remove a rack's segment by name; no error if it does not exist.
+    """Remove a rack's segment by name. A segment that does not exist is no error.
 
-    Raises `SegmentError` when it is another user's.
+    Raises:
+        SegmentError: The segment belongs to another user.
     """
     try:
         posix_ipc.unlink_shared_memory(_shm_name(rack))
@@ -400,27 +449,31 @@ def shm_path(rack: str) -> Path:
 
 
 def _pid_namespace() -> int:
+    """Return the inode of this process's PID namespace."""
     return Path("/proc/self/ns/pid").stat().st_ino
 
 
 def _shm_name(rack: str) -> str:
+    """Return the name under which `posix_ipc` knows the segment of a rack."""
     return f"/{PREFIX}{rack}"
 
 
 def layout_of(plain: dict[str, Any]) -> Layout:
-    """Return a layout from the plain data that `dataclasses.asdict` makes of it. Recordings of
-    earlier versions lack some of it.
+    """Restore a layout from plain data made by `dataclasses.asdict`.
+
+    Recordings of earlier versions lack some fields, which then get their defaults.
     """
     layout: Layout = _restored(Layout, plain)
     return layout
 
 
 def _restored(kind: Any, plain: Any) -> Any:
+    """Convert plain data to an instance of a dataclass or to a tuple, recursively."""
     if isinstance(plain, list):
         inner, *_ = get_args(kind)
         return tuple([_restored(inner, entry) for entry in plain])
     if isinstance(plain, dict):
-        # Of an optional part, the type that is not None.
+        # The first argument of an optional type is the type that is not None.
         record, *_ = get_args(kind) or (kind,)
         types = _types_of(record)
         return record(**{name: _restored(types[name], entry) for name, entry in plain.items()})
@@ -429,4 +482,5 @@ def _restored(kind: Any, plain: Any) -> Any:
 
 @cache
 def _types_of(record: type) -> dict[str, Any]:
+    """Return the types of a dataclass's fields."""
     return get_type_hints(record)

@@ -1,11 +1,13 @@
-"""The semaphores of a rack: two per task, to wake it and for its reports to lockstep; one per
-locked mailbox.
+"""Semaphores of a rack, in the segment itself.
 
-They are unnamed ones of the C library, in the segment itself: no name can be left over, and a copy
-of the segment has its own. `posix_ipc` knows named ones only, and waits by the wall clock: if that
+A task has two, one to wake it and one for its reports to lockstep. A locked mailbox has one. They
+are unnamed semaphores of the C library, so no name can be left over, and a copy of the segment has
+separate ones. `posix_ipc` supports only named semaphores and waits by the wall clock: if the clock
 is set back by an hour, a wait of 2 ms takes an hour. The C library can wait by CLOCK_MONOTONIC
-(since glibc 2.30). Alternatives considered: a futex through ctypes, and an eventfd with `poll`;
-both wake up more slowly.
+(since glibc 2.30).
+
+Alternatives considered: a futex through ctypes, and an eventfd with `poll`. Both wake up more
+slowly.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ from typing import Protocol
 from rack.backplane.address_map import AddressMap
 
 _libc = ctypes.CDLL(None)
-# Calls that never block keep the interpreter's lock: that makes them faster.
+# Calls that never block keep the interpreter's lock, which makes them faster.
 _quick = ctypes.PyDLL(None)
 _sem_clockwait = _libc.sem_clockwait
 _sem_init = _quick.sem_init
@@ -33,22 +35,22 @@ _sem_getvalue.argtypes = ctypes.c_void_p, ctypes.c_void_p
 
 
 class MappedMemory(Protocol):
-    """The memory of a segment, and the addresses in it."""
+    """Memory of a segment and its address map."""
 
     bytes: memoryview
     map: AddressMap
 
 
 class Semaphore:
-    """A semaphore in shared memory, whose waits do not depend on the wall clock.
+    """Semaphore in shared memory whose waits do not depend on the wall clock.
 
-    `release()` posts it. `wait()` waits until the time set by `bind`, and returns 0 when it has
-    obtained the semaphore. A signal may end it early.
+    `release()` posts it. `wait()` waits until the time set by `set_deadline` and returns 0 if it
+    has obtained the semaphore. A signal may end the wait early.
     """
 
     def __init__(self, memory: memoryview, address: int) -> None:
         """Use the semaphore at a bus address of a segment's memory."""
-        # It keeps the memory mapped for as long as there is a semaphore in it.
+        # This view keeps the memory mapped for as long as the semaphore is in use.
         self._place = ctypes.c_char.from_buffer(memory, address)
         at = ctypes.addressof(self._place)
         # A struct timespec, read by the C library in place.
@@ -60,26 +62,26 @@ class Semaphore:
         self._try = partial(_sem_trywait, at)
 
     def initialize(self, value: int) -> None:
-        """Make it, with a value, for all processes that map its memory."""
+        """Create the semaphore with a value, for all processes that map its memory."""
         _sem_init(ctypes.addressof(self._place), 1, value)
 
     @property
     def value(self) -> int:
-        """How many waits it would end now."""
-        found = ctypes.c_int()
-        _sem_getvalue(ctypes.addressof(self._place), ctypes.addressof(found))
-        return found.value
+        """Number of waits that the semaphore would satisfy now."""
+        count = ctypes.c_int()
+        _sem_getvalue(ctypes.addressof(self._place), ctypes.addressof(count))
+        return count.value
 
     def bind(self, deadline_ns: int) -> None:
-        """Let waits end at that time, CLOCK_MONOTONIC."""
+        """Set the time at which waits end, in ns of CLOCK_MONOTONIC."""
         self._deadline[0], self._deadline[1] = divmod(deadline_ns, 1_000_000_000)
 
     def take(self) -> bool:
-        """Obtain the semaphore if that needs no wait; else return False."""
+        """Obtain the semaphore without waiting. Returns False if that is impossible."""
         return not self._try()
 
     def acquire(self, timeout_s: float) -> bool:
-        """Wait at most `timeout_s`; False after that."""
+        """Obtain the semaphore within `timeout_s`. Returns False on timeout."""
         if self.take():
             return True
         deadline_ns = time.monotonic_ns() + int(timeout_s * 1e9)
@@ -91,7 +93,13 @@ class Semaphore:
 
 
 def initialize(memory: memoryview, wake_and_done: Iterable[int], locks: Iterable[int]) -> None:
-    """Make the semaphores of a rack at these bus addresses: locks are free, wake-ups unsent."""
+    """Create the semaphores of a rack.
+
+    Args:
+        memory: Memory of the segment.
+        wake_and_done: Bus addresses of the semaphores of tasks, which start unposted.
+        locks: Bus addresses of the semaphores of locked mailboxes, which start free.
+    """
     for value, addresses in ((0, wake_and_done), (1, locks)):
         for address in addresses:
             Semaphore(memory, address).initialize(value)
@@ -103,8 +111,9 @@ def wake_semaphore(segment: MappedMemory, task: str) -> Semaphore:
 
 
 def done_semaphore(segment: MappedMemory, task: str) -> Semaphore:
-    """Return the semaphore on which lockstep waits for a task's reports, or for the crate to report
-    its loss.
+    """Return the semaphore on which lockstep waits for a task.
+
+    The task posts it with each report, and the crate posts it to report the loss of the task.
     """
     return Semaphore(segment.bytes, segment.map.done[task])
 

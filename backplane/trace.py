@@ -1,13 +1,13 @@
 """Trace rings: one fixed record for each cycle of a task, written without ever waiting.
 
-One record gives lateness (start - release), t_comm (read and write parts), t_exec (the process
+One record gives the lateness (start - release), t_comm (read and write parts), t_exec (the process
 part) and t_residual (deadline - end) of eq. 3.5, t_executor-planner of eq. 3.9 (plan - start), and
 the processor time of the cycle, without preemption. A reader that falls behind knows how many
 records it lost.
 
-A task traces a cycle after its last write. The trace therefore also proves things about messages
-(`CycleRecord`): one that is missing by then was not written, and one that appears later was held
-back. Age alone proves nothing, since the task may have been preempted.
+A task traces a cycle after its last write. The trace therefore also proves facts about messages
+(`CycleRecord`): a message that is missing by then was not written, and a message that appears later
+was held back. Age alone proves nothing, because the task may have been preempted.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ RECORD = np.dtype(
         ("tick", "i8"),  # release, in ticks
         ("release_ns", "i8"),  # the grid point of that tick, CLOCK_MONOTONIC
         ("start_ns", "i8"),
-        # An executor has read its plan over the bus (C of fig. 4); start_ns if it has none to read.
+        # The executor has read its plan over the bus (C of fig. 4). start_ns without a plan.
         ("plan_ns", "i8"),
         ("read_ns", "i8"),  # command, status and plan read
         ("process_ns", "i8"),  # process done
         ("end_ns", "i8"),  # command and status written
-        # Flag in the low 16 bits; above them the number of releases skipped just before
+        # Flag in the low 16 bits. The upper bits are the number of releases skipped just before.
         ("flags", "i8"),
         ("state", "i8"),  # state of the level
-        # processor time of its thread since the last record: this cycle, and waking up for it
+        # Processor time of the thread since the last record: this cycle and its wake-up.
         ("processor_ns", "i8"),
-        ("closed_ns", "i8"),  # the bookkeeping of the cycle before was done; 0: there was none
+        ("closed_ns", "i8"),  # end of the bookkeeping of the previous cycle, 0 without one
     ]
 )
 FIELDS = tuple(RECORD.names or ())
@@ -63,7 +63,7 @@ _BUS_ERROR = int(Flag.BUS_ERROR)
 
 
 class TraceWriter:
-    """The writing end of a task's trace ring."""
+    """Writing end of a task's trace ring."""
 
     def __init__(self, segment: Segment, task: str) -> None:
         spec = segment.layout.task(task)
@@ -73,14 +73,14 @@ class TraceWriter:
         self._count = self._block[Block.TRACE_HEAD]
 
     def write(self, *record: int) -> None:
-        """Append a record: its numbers in the order of `RECORD`."""
+        """Append a record. Its numbers are in the order of `RECORD`."""
         self._count = count = self._count + 1
         _PACK(self._ring, (count & self._mask) * TRACE_RECORD_SIZE, *record)
         self._block[Block.TRACE_HEAD] = count
 
 
 def trace_ring(segment: Segment, task: str) -> Ring:
-    """Return the reading end of a task's trace ring; its rows are of dtype `RECORD`."""
+    """Open the reading end of a task's trace ring. Its rows have dtype `RECORD`."""
     spec = segment.layout.task(task)
     block = segment.block(task)
     memory = segment.view(segment.map.traces[task], spec.depth * TRACE_RECORD_SIZE)
@@ -93,7 +93,7 @@ def trace_ring(segment: Segment, task: str) -> Ring:
 
 
 class CycleRecord:
-    """The trace of one task, as read by the readers of its mailboxes."""
+    """Trace of one task, as used by the readers of its mailboxes."""
 
     def __init__(self, segment: Segment, task: str) -> None:
         self._block = segment.block(task)
@@ -103,7 +103,10 @@ class CycleRecord:
 
     @property
     def finished(self) -> int:
-        """Newest release whose cycle has ended with every access done; -1: none, or not known."""
+        """Newest release whose cycle has ended with every access done.
+
+        It is -1 if there is no such cycle or it is not known.
+        """
         count = self._block[Block.TRACE_HEAD]
         at = self._at(count)
         flags = self._words[at + _FLAGS]
@@ -111,22 +114,25 @@ class CycleRecord:
         return tick if count and not flags & _BUS_ERROR and self._keeps(count) else -1
 
     def ended_ns(self, tick: int) -> int | None:
-        """Return the end of the cycle released at `tick`, CLOCK_MONOTONIC; None without a record of
-        it.
+        """Return the end of the cycle released at `tick`, in ns of CLOCK_MONOTONIC.
+
+        The result is None if the ring has no record of the cycle.
         """
         count = self._block[Block.TRACE_HEAD]
         for number in range(count, max(0, count - self._depth), -1):
             at = self._at(number)
-            found = self._words[at + _TICK]
+            record_tick = self._words[at + _TICK]
             ended_ns = self._words[at + _END]
-            if not self._keeps(number) or found < tick:
+            if not self._keeps(number) or record_tick < tick:
                 return None
-            if found == tick:
+            if record_tick == tick:
                 return ended_ns
         return None
 
     def _keeps(self, number: int) -> bool:
+        """Check whether the record with this number cannot be partly overwritten."""
         return number >= oldest_kept(self._block[Block.TRACE_HEAD], self._depth)
 
     def _at(self, number: int) -> int:
+        """Return the index of the first word of the record with this number."""
         return self._first + number % self._depth * _RECORD

@@ -1,8 +1,8 @@
 """The shared words: every number on the backplane outside messages, by name.
 
 Each is an aligned 64-bit integer with one writer, stored and loaded whole through a memoryview cast
-to 'q'. (`struct` packs byte by byte: a reader could see half a number.) Their places are plain
-integers: a member of an enum takes as long to look up as three words take to read.
+to 'q'. (`struct` packs byte by byte, so a reader could see half a number.) Indices are plain
+integers: looking up an enum member takes as long as reading three words.
 """
 
 from __future__ import annotations
@@ -12,36 +12,35 @@ from typing import Protocol
 
 
 class OnWords(Protocol):
-    """What consists of words of shared memory."""
+    """Object that consists of words of shared memory."""
 
     words: memoryview
 
 
 class Word:
-    """A word at a place among the `words` of an object, as an attribute."""
+    """Descriptor of an attribute that is stored in the `words` of an object at a fixed index."""
 
-    def __init__(self, place: int) -> None:
-        self._place = place
+    def __init__(self, index: int) -> None:
+        self._index = index
 
     def __get__(self, owner: OnWords, kind: type) -> int:
-        return owner.words[self._place]
+        return owner.words[self._index]
 
     def __set__(self, owner: OnWords, value: int) -> None:
-        owner.words[self._place] = value
+        owner.words[self._index] = value
 
 
 def switch(tick: int, is_on: bool) -> int:
-    """Return the value of a word that switches on, or off, at `tick`: until then the opposite
-    holds.
+    """Return the value of a word that switches on, or off, at `tick`.
 
-    So readers agree on it by ticks alone, whenever they look. Each switch follows the opposite one;
-    0: never on.
+    Before that tick the opposite state holds, so all readers agree on the state by ticks alone,
+    whenever they look. Each switch must follow the opposite one. The value 0 means never on.
     """
     return 2 * tick + is_on
 
 
 def is_on(word: int, tick: int) -> bool:
-    """Say whether such a word is on at `tick`."""
+    """Check whether a switch word (see `encode_switch`) is on at `tick`."""
     return bool(word & 1) == (tick >= word >> 1)
 
 
@@ -58,14 +57,14 @@ class Head:
     LAYOUT_SIZE = 7
     CONFIG_AT = 8
     CONFIG_SIZE = 9
-    CREATED_MONOTONIC_NS = 10  # the same moment as CREATED_NS, CLOCK_MONOTONIC
+    CREATED_MONOTONIC_NS = 10  # time of CREATED_NS on CLOCK_MONOTONIC
     PUBLISHED_AT = 11
     PUBLISHED_SIZE = 12
     CHECK = 13  # CRC-32 of the three texts
 
 
 class System:
-    """Words of the system clock and the utility lines, after those of the head."""
+    """Words of the system clock and the utility lines, after the words of the head."""
 
     STATE = 32  # Run
     TICK = 33
@@ -73,38 +72,44 @@ class System:
     PERIOD_NS = 35  # wall-clock time from tick to tick: the clock's period over the speed factor
     LOCKSTEP = 36
     STOP_REQUEST = 37  # written by the host
-    STOP_TICK = 38  # first tick after the run; 0: not known
-    CLOCK_SKIPPED = 39  # ticks skipped by the clock itself
-    FOLLOWER_PID = 40  # of the recorder for which lockstep waits; 0: none
-    FOLLOWER_TICK = 41  # everything up to here is recorded
+    STOP_TICK = 38  # first tick after the run, 0 if not known
+    CLOCK_SKIPPED = 39  # number of ticks skipped by the clock itself
+    FOLLOWER_PID = 40  # process of the recorder for which lockstep waits, 0 for none
+    FOLLOWER_TICK = 41  # everything up to this tick is recorded
     TICK_NS = 42  # CLOCK_MONOTONIC of the newest tick
-    # rises with every change in the fault table that concerns tasks; written by the clock
+    # Rises with every change in the fault table that concerns tasks. Written by the clock.
     FAULTS = 43
-    DEMAND = 44  # Demand of the utility lines on the arm; written by the clock
+    DEMAND = 44  # Demand on the arm, written by the clock
     CLOCK_PID = 45
-    INJECTED = 46  # faults put into the fault table so far
-    LOSSES = 47  # rises by 2 for each board found dead; odd while the crate records it
+    INJECTED = 46  # number of faults entered into the fault table
+    LOSSES = 47  # rises by 2 for each board found dead; odd while the crate records a loss
     SYSRESET = 48
     ACFAIL = 49
     EMERGENCY_STOP = 50
-    REQUESTED = 51  # commands put into the operator table so far
-    COMMANDED = 52  # serial of the newest command issued; written by the clock
-    # 1 + tick before which lockstep holds, for single steps; 0: it does not. Written by the host
+    REQUESTED = 51  # number of commands entered into the operator table
+    COMMANDED = 52  # serial of the newest command issued, written by the clock
+    # 1 + tick before which lockstep must hold, for single steps. 0 without a hold. Written by the
+    # host.
     HOLD_AT = 53
-    HELD = 54  # 1 + tick before which it holds now; 0: it does not. Written by the clock
-    # while another rack is lost, the arm is to stop: see `switch`. Written by the network adapter
+    # 1 + tick before which lockstep is holding now. 0 without a hold. Written by the clock.
+    HELD = 54
+    # Switch (see `encode_switch`) that is on while the arm must stop because another rack is lost.
+    # Written by the network adapter.
     PEER_STOP = 55
     SKIPPED_FROM = 56  # first of the ticks that the clock skipped last
-    # the recorder has taken everything up to here, whether or not it is in its files
+    # The recorder has taken everything up to this tick, whether or not it is in its files.
     FOLLOWER_DRAINED = 57
-    # 1 + tick before which lockstep takes a snapshot; 0: none is wanted. Written by the Rack
+    # 1 + tick before which lockstep takes a snapshot, 0 for none. Written by the Rack.
     SNAPSHOT_AT = 58
-    # snapshots cost one part in so many of lockstep's time; 0: there is only that one. By the Rack
+    # Snapshots may take 1 / SNAPSHOT_PART of lockstep's time, 0 for no such snapshots. Written by
+    # the Rack.
     SNAPSHOT_PART = 59
-    SNAPSHOT_EVERY = 60  # ticks between two that are taken besides; 0: none. Written by the Rack
-    SNAPSHOTS = 61  # held by the crate, of this rack or of those before it; written by the crate
-    SNAPSHOT_BYTES = 62  # the memory that they have for themselves; written by the crate
-    SYSFAIL = 64  # one word per slot, 22 of them: 1 until the board's self-test has passed
+    # Ticks between additional periodic snapshots, 0 for none. Written by the Rack.
+    SNAPSHOT_EVERY = 60
+    # Number of snapshots held by the crate, of this rack or of earlier ones. Written by the crate.
+    SNAPSHOTS = 61
+    SNAPSHOT_BYTES = 62  # memory used by the snapshots alone, written by the crate
+    SYSFAIL = 64  # one word for each of 22 slots: 1 until the board's self-test has passed
 
 
 class Run(IntEnum):
@@ -116,8 +121,9 @@ class Run(IntEnum):
 
 
 class Demand(IntEnum):
-    """Values of `System.DEMAND`: the demand of the rack's safety on the arm; a greater one is
-    stronger.
+    """Values of `System.DEMAND`, which the rack's safety functions demand of the arm.
+
+    A greater demand is stronger.
     """
 
     NONE = 0
@@ -126,50 +132,55 @@ class Demand(IntEnum):
 
 
 class Block:
-    """Words of a task's control block, written by the task; RELEASED by the clock, LOST by the
-    finder of a loss.
+    """Words of a task's control block.
 
-    A host board has one too. In lockstep its bus adapter releases it: see
-    `rack.boards.host.bus_adapter`.
+    The task writes them, except for RELEASED, which the clock writes, and LOST, which is written by
+    the process that finds the loss. A host board has a control block too. In lockstep its bus
+    adapter releases it: see `rack.boards.host.bus_adapter`.
     """
 
-    RELEASED = 0  # newest release, as a tick; -1: none yet. Of a batch: its last
+    # Newest release, as a tick; the last one of a batch. -1 before the first.
+    RELEASED = 0
     DEADLINE = 1  # tick before which that cycle, or plan, must be finished
-    DONE = 2  # newest release that is finished; -1: none yet
+    DONE = 2  # newest release that is finished, -1 before the first
     PID = 3
     STATE = 4  # TaskState
     CYCLES = 5
     MISSED = 6
     SKIPPED = 7
-    PRIORITY = 8  # SCHED_FIFO priority obtained; 0: ordinary scheduling
+    PRIORITY = 8  # SCHED_FIFO priority obtained, 0 for ordinary scheduling
     CORE = 9
     READS = 10
     READ_BYTES = 11
     WRITES = 12
     WRITE_BYTES = 13
-    CORRUPT = 14  # messages that failed their check
-    BUS_ERRORS = 15  # accesses cut off by their bound
-    TRACE_HEAD = 16  # trace records written
+    CORRUPT = 14  # number of messages that failed their check
+    BUS_ERRORS = 15  # number of accesses that timed out
+    TRACE_HEAD = 16  # number of trace records written
     LEVEL_STATE = 17  # state of the level, as in its status
-    PLANS = 18  # plans made
-    # 1 + tick at which the task was found dead or hanging; 0: not lost. The clock clears it
+    PLANS = 18  # number of plans made
+    # 1 + tick at which the task was found dead or hanging, 0 if it is not lost. Cleared by the
+    # clock.
     LOST = 19
     LEVEL_SINCE = 20  # tick of the cycle in which the level entered that state
-    # of the network adapter in lockstep: the rack that its cycle awaits; 0: none. See
-    # boards.lan.awaited
+    # Of the network adapter in lockstep: the rack that its cycle waits for, 0 for none. See
+    # boards.lan.awaited.
     AWAITS = 21
-    # messages that have interrupted this board and were served, under protocol interrupt
+    # Number of messages that have interrupted this board and were served (protocol interrupt).
     INTERRUPTS = 22
-    INTERRUPTS_LOST = 23  # those lost because too many waited
-    INTERRUPTS_WAITING = 24  # the largest number that has waited
-    CLOCK_SKIPPED = 25  # ticks skipped by the clock that this task has reported
-    # of a host board in lockstep: tick until which its program waits; 0: a message has come
+    INTERRUPTS_LOST = 23  # number of messages lost because too many waited
+    INTERRUPTS_WAITING = 24  # largest number of messages that have waited
+    CLOCK_SKIPPED = 25  # number of ticks skipped by the clock that this task has reported
+    # Of a host board in lockstep: tick until which its program waits, 0 if a message has come.
     WAITS_UNTIL = 26
-    # 1 + tick before which the task is to fork a copy; 0: it is not, or has. Set by the clock
+    # 1 + tick before which the task must fork a copy, 0 for none. Set by the clock.
     COPY = 27
-    TRACE_FIRST = 28  # trace records before this run, which continues another; written by the crate
-    FIRST = 29  # in lockstep, first of the releases given together with RELEASED; by the clock
-    FAILED = 30  # where in its code the last process of the task failed, and how often in a row
+    # Number of trace records written before this run, which continues another. Written by the
+    # crate.
+    TRACE_FIRST = 28
+    # In lockstep, first of the releases given together with RELEASED. Written by the clock.
+    FIRST = 29
+    FAILED = 30  # place in the code where the last process failed, and how often in a row
 
 
 class TaskState(IntEnum):
@@ -187,34 +198,38 @@ class TaskState(IntEnum):
 class Box:
     """Words at the head of a mailbox."""
 
-    HEAD = 0  # serial of the newest whole message; 0: none
-    EPOCH = 1  # counts the writers that have claimed the mailbox
+    HEAD = 0  # serial of the newest complete message, 0 before the first
+    EPOCH = 1  # number of writers that have claimed the mailbox
     WRITER_PID = 2
-    CLAIM = 3  # no value: the writer holds the kernel's lock on this address
-    # the same for the critical section of protocol lock; value: its owner's process id, 0: none
+    CLAIM = 3  # has no value: the writer holds the kernel's lock on this address
+    # Address of the kernel's lock on the critical section of protocol lock. The value is the
+    # process id of the owner, 0 for none.
     OWNER = 4
-    # epoch and process of the writer in one number, as in every slot that it fills: `slots.claim`
+    # Epoch and process of the writer in one number, as in every slot that it fills. See
+    # `slots.build_signature`.
     CLAIMANT = 5
-    REFUSED = 6  # of a queue: messages refused because it was full
-    # of a queue: serial of the newest message of its own writer; HEAD is greater while another has
-    # published
+    REFUSED = 6  # number of messages refused because the queue was full
+    # Of a queue: serial of the newest message of its lawful writer. HEAD is greater after an
+    # intruder has published.
     SENT = 7
-    # in a host board's mailbox: serial of the newest message that its bus adapter has taken
+    # Of a host board's mailbox: serial of the newest message that its bus adapter has taken.
     TAKEN = 8
-    # of what comes from another rack, while that is lost: its writer counts as lost. See `switch`
+    # Of messages from another rack: switch (see `encode_switch`) that is on while the other rack is
+    # lost, so that the writer counts as lost.
     VOID = 9
-    KEPT = 10  # the same, for racks that go on: its information does not grow too old. See `switch`
-    # of a queue: serial of the newest message taken, times 3: see `queue.QueueReader`
+    # The same for racks that continue alone: the information does not grow too old while it is on.
+    KEPT = 10
+    # Of a queue: serial of the newest message taken, times 3. See `queue.QueueReader`.
     POSITION = 11
-    FIRST = 12  # serial of the newest message before this run: see `Block.TRACE_FIRST`
+    FIRST = 12  # serial of the newest message before this run, see `Block.TRACE_FIRST`
 
 
 class Slot:
     """Words in front of every message in its slot.
 
-    The checksum covers BASIS to the end of the message and, as it is seeded with CHAIN, the
-    checksum of the message before, all earlier messages. It does not cover time stamp and writer,
-    so that equal runs have equal checksums.
+    The checksum covers the bytes from BASIS to the end of the message and, because it is seeded
+    with CHAIN (the checksum of the previous message), all earlier messages. It does not cover time
+    stamp and writer, so that equal runs have equal checksums.
     """
 
     STAMP_NS = 0

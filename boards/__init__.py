@@ -5,17 +5,17 @@
     with Rack.from_file("nasrem") as rack:
         print(rack.run(seconds=10))
 
-- `Rack` launches the boards of a config, supervises them and ends them; `Outcome` says how a run
-  ended.
-- `OneProcess` runs their levels in one process, tick by tick: for the test of a level.
-- `Event` is one occurrence in a run; `Rack(config, on_event=...)` passes each to your program as it
+- `Rack` launches the boards of a config, supervises them and ends them. `Outcome` describes how a
+  run ended.
+- `OneProcess` runs the levels of a config in one process, tick by tick, to test a level.
+- `Event` is one occurrence in a run. `Rack(config, on_event=...)` passes each to your program as it
   happens.
-- `load` reads a config by name or path, with overrides; `RackConfig` is the result.
-- `BoardError` is the root of all errors: `ConfigError` holds every `Mistake` of a config,
+- `load` reads a config by name or path, with overrides. `RackConfig` is the result.
+- `BoardError` is the root of all errors: `ConfigError` contains every `Mistake` of a config, and
   `LaunchError` means that a board did not start.
 
-Names are imported on first use: the crate and its boards import parts of this package and must stay
-small.
+Names are imported on first use, because the crate and its boards import parts of this package and
+must stay small.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""The exception tree of the boards, with the cause of each error.
+"""Exceptions of the boards, with the cause of each.
 
-`BoardError` is the root: catch it and every refusal of this package is caught.
+`BoardError` is the root. Catching it catches every error that this package raises on purpose.
 
 - `ConfigError`: a config with mistakes, all of them at once, before any process starts.
-- `LaunchError`: a board that did not start: its self-test failed, or it was not ready in time.
-- `SnapshotError`: a process that cannot be copied, or a snapshot from which a rack cannot go on.
+- `LaunchError`: a board did not start, because its self-test failed or it was not ready in time.
+- `SnapshotError`: a process that cannot be copied, or a snapshot from which a rack cannot continue.
 """
 
 from __future__ import annotations
@@ -20,12 +20,15 @@ CANNOT_GO_ON = 4
 """Exit status of a board that a restart would not help."""
 
 UNKEPT = "no snapshots: "
-"""Begins the note of a run that takes none, with the reason after it."""
+"""Prefix of the note of a run that takes no snapshots. The reason follows."""
 
 
 class Failure(Exception):
-    """A command, or a call of a program, that did not work. The message is for the user, `status`
-    the exit status of the command.
+    """Raised if a command, or a call of a program, has failed.
+
+    Args:
+        reason: Message for the user.
+        status: Exit status of the command.
     """
 
     def __init__(self, reason: str, status: int = 1) -> None:
@@ -34,15 +37,15 @@ class Failure(Exception):
 
 
 class BoardError(Failure):
-    """Root of every error this package raises; its text is one line for the user."""
+    """Root of all errors of this package. Its text is one line for the user."""
 
 
 class LaunchError(BoardError):
-    """A rack with a correct config that cannot be launched."""
+    """Raised if a rack with a correct config cannot be launched."""
 
 
 class SnapshotError(BoardError):
-    """A process that cannot be copied, or a snapshot from which a rack cannot go on."""
+    """Raised if a process cannot be copied, or a rack cannot continue from a snapshot."""
 
     def __init__(self, reason: str) -> None:
         super().__init__(reason, 2)
@@ -50,8 +53,12 @@ class SnapshotError(BoardError):
 
 @dataclass(frozen=True)
 class Mistake:
-    """One mistake in a config: its place, the value there (None: none), and the reason or the
-    permitted values.
+    """One mistake in a config.
+
+    Attributes:
+        place: Key of the mistake.
+        value: Value of the key, None for no value.
+        why: The reason, or the permitted values.
     """
 
     place: str
@@ -65,12 +72,13 @@ class Mistake:
 
 
 Mistakes = Iterator[Mistake]
-"""What a rule yields."""
+"""Result type of a rule."""
 
 
 class ConfigError(BoardError):
-    """A config that cannot run. `mistakes` holds every mistake found; the text has one line per
-    mistake.
+    """Raised for a config that cannot run.
+
+    `mistakes` contains every mistake found, and the text has one line per mistake.
     """
 
     def __init__(self, mistakes: Iterable[Mistake]) -> None:
@@ -79,7 +87,7 @@ class ConfigError(BoardError):
 
 
 def shown(value: Any) -> str:
-    """Return a config value as in TOML, shortened to one line."""
+    """Format a config value as in TOML, shortened to one line."""
     value = list(value) if isinstance(value, tuple) else value
     try:
         text = str(value)
@@ -93,6 +101,6 @@ def shown(value: Any) -> str:
 
 
 def one_line(text: str, longest: int) -> str:
-    """Return text as one line of at most `longest` characters, without control characters."""
+    """Format text as one line of at most `longest` characters, without control characters."""
     text = "".join(c if c.isprintable() else "?" for c in " ".join(text[: 2 * longest].split()))
     return text if len(text) <= longest else f"{text[: longest - 3]}..."

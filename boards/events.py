@@ -1,4 +1,4 @@
-"""The record of a run: its events as they happen, and its end."""
+"""Events of a run as they happen, and the judgement of its end."""
 
 from __future__ import annotations
 
@@ -33,18 +33,25 @@ OfRun = Literal[
 OfFaults = Literal["fault", "detection", "miss", "reaction", "recovery", "held"]
 EventKind = OfRun | OfFaults
 CONTINUES = "continues"
-"""Code of the event that says before which tick a run begins that goes on from another."""
+"""Code of the event with the first tick of a run that continues another one."""
 
 
 @dataclass(frozen=True)
 class Event:
-    """An occurrence in a run. `time_ns` is CLOCK_REALTIME; `tick` is the system clock's (-1: before
-    the run).
+    """Occurrence in a run.
 
-    For programs: `code` is an alarm's name in lower case, "begins" or "ends" for a fault, or an
-    operator's command; `fault` is an entry of the fault table (-1: none); `subject` is the affected
-    mailbox, joint, task or level; `value` is the measured value, or a command's serial; `since` is
-    the tick at which the condition began (-1: unknown).
+    Attributes:
+        time_ns: CLOCK_REALTIME.
+        tick: Tick of the system clock, -1 before the run.
+        kind: Kind of event.
+        board: Board that the event concerns, empty for the whole rack.
+        text: Description for people.
+        code: Code for programs: an alarm's name in lower case, "begins" or "ends" for a fault,
+            or an operator's command.
+        fault: Index of an entry of the fault table, -1 for none.
+        subject: Affected mailbox, joint, task or level.
+        value: Measured value, or the serial of a command.
+        since: Tick at which the condition began, -1 if unknown.
     """
 
     time_ns: int
@@ -61,18 +68,22 @@ class Event:
 
 DEMANDED = "a stop is demanded"
 NO_TORQUE = "no torque"
-"""Reasons for which brakes engage: on a demand, of which other events say why, or because no torque
-came in time."""
+"""Reason for brakes that engaged because no torque came in time.
+
+Brakes that engage on a demand (`DEMANDED`) have their cause in other events.
+"""
 HELD_MS = 5e3
-"""Time on end for which an arm may be braked, or a level held, in a run that succeeds, without a
-cause in sight."""
+"""Time without interruption for which an arm may be braked, or a level held, in ms.
+
+A longer time without a known cause makes a run fail.
+"""
 HELD_PART = 0.5
-"""Part of a run for which an arm may be braked so, again and again."""
+"""Share of a run for which an arm may be braked in total without a known cause."""
 
 
 @dataclass(frozen=True)
 class Braking:
-    """Brakes that engaged for one reason at tick `since`."""
+    """Engagement of the brakes for one reason, from tick `since` on."""
 
     why: str
     since: int
@@ -80,31 +91,39 @@ class Braking:
 
 
 def brakings(events: Sequence[Event], end: int, tick_ms: float) -> tuple[Braking, ...]:
-    """Return every time that brakes engaged in a run of `end` ticks, by its events; not those of
-    the start.
+    """List every engagement of the brakes in a run, except at the start.
+
+    Args:
+        events: Events of the run.
+        end: Number of ticks of the run.
+        tick_ms: Length of a tick.
     """
     changes = [event for event in events if event.code in ("brakes_closed", "brakes_opened")]
-    found = [
-        (one.subject, one.tick - int(one.value), one.tick)
-        for one in changes
-        if one.code == "brakes_opened"
+    engagements = [
+        (change.subject, change.tick - int(change.value), change.tick)
+        for change in changes
+        if change.code == "brakes_opened"
     ]
     if changes and changes[-1].code == "brakes_closed":
-        found.append((changes[-1].subject, changes[-1].tick, end))
+        engagements.append((changes[-1].subject, changes[-1].tick, end))
     return tuple(
         Braking(why, since, round((until - since) * tick_ms, 6))
-        for why, since, until in found
+        for why, since, until in engagements
         if why
     )
 
 
 def braked_text(found: Sequence[Braking]) -> str:
-    """Return how often brakes engaged, at least once, how long, and why, as readable text."""
-    longest = max(found, key=lambda one: one.lasted_ms)
-    total_ms = sum(one.lasted_ms for one in found)
+    """Describe how often and how long brakes were engaged, and why.
+
+    Args:
+        found: At least one engagement.
+    """
+    longest = max(found, key=lambda braking: braking.lasted_ms)
+    total_ms = sum(braking.lasted_ms for braking in found)
     times = f"{total_ms:g} ms in all, longest {longest.lasted_ms:g} ms at tick {longest.since}"
     reasons = ", ".join(
-        f"{why} ({count})" for why, count in Counter(one.why for one in found).most_common()
+        f"{why} ({count})" for why, count in Counter(braking.why for braking in found).most_common()
     )
     return f"brakes engaged {len(found)} time{'s' * (len(found) > 1)}, {times}: {reasons}"
 
@@ -118,22 +137,31 @@ Cause = Literal[
     "board lost",
     "launcher lost",
 ]
-"""A task is refused if it never began, as it has no moves; any other task that ends with an error
-has failed."""
+"""Reason why a run ended.
+
+A task is refused if it never began, which shows in a status without moves. Any other task that ends
+with an error has failed.
+"""
 SUCCESSES: tuple[Cause, ...] = ("task done", "time over")
 """Causes of a run that may have succeeded."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """The end of a run: its cause, its length in ticks, and the digest of everything written until
-    then.
+    """End of a run.
 
-    `state` and `reason` are those of the level that ends the run; `faults` are latched faults, lost
-    boards, objects beyond their goals when the task says that it is done, long holds without a
-    cause in sight, and levels that lost too many cycles. `brakings` are those after the start;
-    `objects`: where each ended; `excused`: a line for each level that lost too many cycles because
-    of injected faults.
+    Attributes:
+        cause: Reason for the end.
+        ticks: Length in ticks.
+        state: Last state of the level that ends the run.
+        reason: Reason in the last status of that level.
+        digest: Digest of everything written until the end.
+        faults: Reasons why the run failed: latched faults, lost boards, objects beyond their
+            goals although the task reports that it is done, long holds without a known cause,
+            and levels that lost too many cycles.
+        brakings: Engagements of the brakes after the start.
+        objects: Final positions of objects with goals.
+        excused: A line for each level that lost too many cycles because of injected faults.
     """
 
     cause: Cause
@@ -148,8 +176,9 @@ class Outcome:
 
     @property
     def failure(self) -> str:
-        """Why the run failed: a fault, or a task that was refused, failed or cut short; empty if it
-        succeeded.
+        """Reason why the run failed, empty if it succeeded.
+
+        A run fails by a fault, or because its task was refused, failed or cut short.
         """
         faults = "; ".join(self.faults)
         if self.cause in SUCCESSES:
@@ -158,21 +187,24 @@ class Outcome:
 
     @property
     def worked(self) -> bool:
-        """Whether the run succeeded."""
+        """True if the run succeeded."""
         return not self.failure
 
 
 def order_key(entry: Mapping[str, Any]) -> float:
-    """Return the place of an entry in an event log: its tick.
+    """Return the sort key of an entry in an event log, its tick.
 
-    Some events are known late: a board that drives an arm tells, once it is back, when the brakes
+    Some events are known late: a board that drives an arm reports after its return when the brakes
     engaged. Entries without a tick, such as the outcome, come last.
     """
     return float(entry.get("tick", math.inf))
 
 
 class Journal:
-    """Keeps `events`, and calls `on_event` with each. Without a `segment` there is no tick."""
+    """List of events that calls `on_event` with each new one.
+
+    `segment` supplies the ticks. Events have no tick while it is None.
+    """
 
     def __init__(self, on_event: Callable[[Event], None] | None) -> None:
         self.events: list[Event] = []
@@ -189,7 +221,17 @@ class Journal:
         tick: int | None = None,
         subject: str = "",
     ) -> None:
-        """Record an event that happens now, or happened at CLOCK_MONOTONIC `at_ns` and `tick`."""
+        """Record an event.
+
+        Args:
+            kind: Kind of event.
+            board: Board that the event concerns, empty for the whole rack.
+            text: Description for people.
+            code: Code for programs.
+            at_ns: Time of the event on CLOCK_MONOTONIC, by default now.
+            tick: Tick of the event, by default the current tick.
+            subject: Affected mailbox, joint, task or level.
+        """
         now_ns = time.time_ns()
         stamp_ns = now_ns if at_ns is None else now_ns - time.monotonic_ns() + at_ns
         if tick is None:
@@ -204,22 +246,23 @@ class Journal:
 
     @property
     def _tick(self) -> int:
+        """Current tick, -1 before the run."""
         if self.segment is None or self.segment.words[System.STATE] == Run.STARTING:
             return -1
         return self.segment.words[System.TICK]
 
 
 def statuses(segment: Segment, field: str) -> Iterator[tuple[str, AnyMessage]]:
-    """Yield the last status of every level whose status has a field, with its board."""
+    """Yield board and last status of every level whose status has the given field."""
     for box in segment.layout.mailboxes:
-        if box.name.endswith(".status") and field in (own.name for own in box.fields):
+        if box.name.endswith(".status") and field in (declared.name for declared in box.fields):
             status = open_observer(segment, box.name).peek()
             if status.is_there:
                 yield box.writer, status.message
 
 
 def arm_states(segment: Segment) -> Iterator[tuple[str, AnyMessage]]:
-    """Yield the last state of every arm or hand, which it counts by itself, with its board."""
+    """Yield board and last state of every arm or hand."""
     for box in segment.layout.mailboxes:
         if box.message == "arm_state":
             yield box.writer, open_observer(segment, box.name).peek().message
@@ -248,10 +291,12 @@ class Ending:
         return state_name(status.state), reason
 
     def latched(self) -> list[str]:
-        """Return a line for every level whose last status reports an error, except the level that
-        ends the run; and for every arm that counts what its level does not report.
+        """Describe the latched faults of levels and arms, one line each.
+
+        A level has one if its last status reports an error, except for the level that ends the run.
+        An arm has one if it counted violations or contacts that its level does not report.
         """
-        told = {
+        reported = {
             board: f"level '{board}': {reason_of(status) or f'error {status.error}'}"
             for board, status in statuses(self._segment, "error")
             if status.error and f"{board}.status" != self._ends_run
@@ -262,15 +307,21 @@ class Ending:
             for board, state in arm_states(self._segment)
             if state.violations or state.touches
         }
-        return [*(counted | told).values()]
+        return [*(counted | reported).values()]
 
     def held(
         self, events: Sequence[Event], found: Sequence[Braking], ran_ms: float
     ) -> Iterator[str]:
-        """Yield in a line what held a run of `ran_ms` for so long that it is no success.
+        """Yield a line for each reason why a hold was too long for a successful run.
 
-        Nothing is yielded with a cause in sight: a fault was injected, an operator has commanded, a
-        stop is demanded. Levels of a rack on a network wait for other racks, and show for which.
+        Nothing is yielded if the cause is known: a fault was injected, an operator has commanded,
+        or a stop is demanded. Levels of a rack on a network are exempt, because they wait for other
+        racks and report for which.
+
+        Args:
+            events: Events of the run.
+            found: Engagements of the brakes.
+            ran_ms: Length of the run.
         """
         segment = self._segment
         if segment.words[System.DEMAND] or any(
@@ -284,30 +335,34 @@ class Ending:
             for name, message in (*arm_states(segment), *statuses(segment, "braked"))
             if message.braked and name not in hands and not found
         }
-        never = []
+        unreleased = []
         for name, message in braked.items():
             since = segment.block(name)[Block.LEVEL_SINCE]
             why = reason_of(message) or NO_TORQUE
-            never.append(Braking(why, since, ran_ms - since * tick_ms))
+            unreleased.append(Braking(why, since, ran_ms - since * tick_ms))
         held = []
         for name, status in statuses(segment, "state"):
             block = segment.block(name)
             lasted_ms = ran_ms - block[Block.LEVEL_SINCE] * tick_ms
             if block[Block.LEVEL_STATE] == State.HOLDING and lasted_ms > HELD_MS:
                 held.append(
-                    f"level '{name}' held for {lasted_ms:g} ms without a cause in sight:"
+                    f"level '{name}' held for {lasted_ms:g} ms without a known cause:"
                     f" {reason_of(status) or 'no reason given'}"
                 )
-        counted = [one for one in found if one.why != DEMANDED] or never
-        times = [one.lasted_ms for one in counted]
+        counted = [braking for braking in found if braking.why != DEMANDED] or unreleased
+        times = [braking.lasted_ms for braking in counted]
         if max(times, default=0.0) > HELD_MS or sum(times) > HELD_PART * ran_ms:
-            yield f"held without a cause in sight, in {ran_ms:g} ms: {braked_text(counted)}"
+            yield f"held without a known cause, in {ran_ms:g} ms: {braked_text(counted)}"
         elif not any(box.name.startswith("lan.") for box in segment.layout.mailboxes):
             yield from held
 
     def ends(self, goals: Mapping[int, GoalConfig]) -> tuple[ObjectEnd, ...]:
-        """Return where objects that have goals ended, as sensed last; none if nothing senses
-        them.
+        """Return the final positions of objects that have goals, as sensed last.
+
+        The result is empty if no level senses them.
+
+        Args:
+            goals: Goals by the row of the object in the scene message.
         """
         for box in self._segment.layout.mailboxes:
             if (
@@ -326,14 +381,15 @@ class Ending:
         fields = self._segment.layout.mailbox(self._ends_run).fields
         if status.state != State.ERROR and not self._silence():
             return "task done" if status.state == State.DONE else "time over"
-        # The field `moves` of a status counts the moves of its program: none if it was refused.
+        # The field `moves` of a status counts the moves of its program. A refused one has none.
         counts_moves = any(field.name == "moves" and not field.shape for field in fields)
         is_refused = counts_moves and not status.moves
         return "task refused" if is_refused else "task failed"
 
     def _silence(self) -> int:
-        """Return the ticks since the last status of the level that ends the run; 0 if permitted, or
-        if it has ended.
+        """Return the ticks since the last status of the level that ends the run.
+
+        The result is 0 while the silence is permitted, or if the level has ended.
         """
         assert self._observer is not None, "some level ends the run"
         reading = self._observer.peek()
@@ -346,7 +402,7 @@ class Ending:
 
 @dataclass(frozen=True)
 class ObjectEnd:
-    """The goal of an object, and where it ended, m."""
+    """Goal and final position of an object, in m."""
 
     object: str
     goal: Sequence[float]
@@ -356,7 +412,7 @@ class ObjectEnd:
 
     @classmethod
     def of(cls, goal: GoalConfig, ended: Sequence[float]) -> Self:
-        """Return the end of the object that has a goal, m."""
+        """Compare the final position of an object with its goal, in m."""
         off_mm = round(1e3 * math.dist(ended, goal.position), 3)
         return cls(goal.object, goal.position, ended, off_mm, goal.tolerance_mm)
 

@@ -1,8 +1,7 @@
-"""The exchange of a board: which message of each port is in use, its age, and when the board took
-it.
+"""The exchange record of a board: the message of each port in use, with its age and arrival.
 
-A board whose config has tables `[board.<name>.exchange.<port>]` writes this into its mailbox
-`<name>.exchange` in every cycle, so that ages and arrivals are on record like any other message.
+A board whose config has tables `[board.<name>.exchange.<port>]` writes the record into its mailbox
+`<name>.exchange` in every cycle, so that ages and arrivals are recorded like any other message.
 """
 
 from __future__ import annotations
@@ -15,21 +14,24 @@ from rack.backplane.mailbox.mailbox import Reader, Reading, Verdict
 from rack.backplane.message import AnyMessage, Message, field, make_message
 
 if TYPE_CHECKING:
-    # A look at a running rack must not import the levels.
+    # A tool that inspects a running rack must not import the levels.
     from rack.boards.wiring import Source
 
 EXCHANGE = "exchange"
-"""Port, and message type, of the exchange."""
+"""Name of the port and of the message type."""
 AGE = "age"
 TAKEN = "taken"
-"""Ends of the names of its fields."""
+"""Suffix of the names of fields with arrivals. `AGE_SUFFIX` is the suffix for ages."""
 _NEW = Verdict.NEW  # for the hot path
 NEVER = -1
-"""Tick at which a message was taken before there is one."""
+"""Tick of arrival before the first message."""
 
 
 def exchange_message(reads: Mapping[str, Source]) -> type[Message]:
-    """Return the message class for a board that reads these ports: two fields for each mailbox."""
+    """Create the message class for a board that reads these ports.
+
+    It has two fields for each mailbox.
+    """
     age = (
         "from the release of the message in use to that of this cycle; negative: released later; 0"
         " before the first"
@@ -46,21 +48,21 @@ def exchange_message(reads: Mapping[str, Source]) -> type[Message]:
 
 @dataclass(frozen=True)
 class PortAge:
-    """Age and arrival of the message in use, as in the exchange message: both in ticks."""
+    """Age and arrival of the message in use, in ticks."""
 
     age: int
     taken: int
 
 
 def ages_of(exchange: Message) -> dict[str, PortAge]:
-    """Return the inputs of an exchange message that have a message in use, by label."""
+    """Return age and arrival of the inputs that have a message in use, by label."""
     names = exchange.record.dtype.names or ()
     values = iter(exchange.raw.cast("q"))
     labels = [name.removesuffix(f"_{AGE}") for name in names[::2]]
-    found = {
+    ports = {
         label: PortAge(age, taken) for label, age, taken in zip(labels, values, values, strict=True)
     }
-    return {label: port for label, port in found.items() if port.taken != NEVER}
+    return {label: port for label, port in ports.items() if port.taken != NEVER}
 
 
 class Taken(NamedTuple):
@@ -72,19 +74,20 @@ class Taken(NamedTuple):
 
 
 class ExchangeRecord:
-    """Fills a board's exchange message from its inputs, which come in the order of
-    `exchange_message`.
+    """Fills a board's exchange message from its inputs.
+
+    The inputs are in the order of `build_exchange_message`.
     """
 
     def __init__(self, inputs: Sequence[Taken], message: Message) -> None:
         self._inputs = tuple(inputs)
-        # Age and tick of each input, in turn.
+        # Age and arrival of each input alternate.
         self._values = message.raw.cast("q")
         for at in range(len(self._inputs)):
             self._values[2 * at + 1] = NEVER
 
     def fill(self, tick: int) -> None:
-        """Note the messages in use, after the reads of the cycle released at `tick`."""
+        """Record the messages in use, after the reads of the cycle released at `tick`."""
         values = self._values
         at = 0
         for readings, key, reader in self._inputs:

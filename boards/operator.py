@@ -1,4 +1,4 @@
-"""An operator's requests: the level that each addresses, its message, and the command in words."""
+"""Operator requests: the addressed level, the message, and the command as text."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def level_of(entry: RequestEntry, layout: Layout) -> str:
 
 
 def message_of(entry: RequestEntry, layout: Layout) -> OperatorCommand:
-    """Return a copy of a request's message, an `OperatorCommand`."""
+    """Return a copy of a request's message."""
     spec = _mailbox(entry, layout)
     message = OperatorCommand(message_dtype(spec.fields, spec.size))
     message.raw[:] = entry.message[: spec.size]
@@ -26,39 +26,44 @@ def message_of(entry: RequestEntry, layout: Layout) -> OperatorCommand:
 
 
 def _mailbox(entry: RequestEntry, layout: Layout) -> MailboxSpec:
-    """Return the mailbox of a request. Raises `DamageError` if it is no operator's."""
-    found = pick(layout.mailboxes, entry.mailbox, "mailbox")
-    if found.message != OperatorCommand.message_type.name:
-        raise DamageError(f"a command for '{found.name}'")
-    return found
+    """Return the mailbox of a request.
+
+    Raises:
+        DamageError: The mailbox is not an operator's.
+    """
+    mailbox = pick(layout.mailboxes, entry.mailbox, "mailbox")
+    if mailbox.message != OperatorCommand.message_type.name:
+        raise DamageError(f"mailbox '{mailbox.name}' does not take operators' commands")
+    return mailbox
 
 
 def hold(mailbox: MailboxSpec) -> OperatorCommand:
-    """Return the operator's hold, for the mailbox of a level's operator."""
+    """Build the operator's hold command for the operator mailbox of a level."""
     message = OperatorCommand(message_dtype(mailbox.fields, mailbox.size))
     message.what = Operation.HOLD
     return message
 
 
 def describe(message: OperatorCommand) -> str:
-    """Return a command as one line: its verb, what it names, and its goal."""
-    what = as_named(Operation, message.what).name.lower()
+    """Describe a command in one line: its verb, the name in it, and its goal."""
+    verb = as_named(Operation, message.what).name.lower()
     goal = message.goal
     if goal == Goal.JOINTS:
-        return f"{what} joints {_numbers(message.joints[: message.count])}"
+        return f"{verb} joints {_numbers(message.joints[: message.count])}"
     if goal == Goal.POSE:
         return (
-            f"{what} position {_numbers(message.position)} quaternion"
+            f"{verb} position {_numbers(message.position)} quaternion"
             f" {_numbers(message.quaternion)}"
         )
     if goal == Goal.DIRECTION:
         return (
-            f"{what} position {_numbers(message.position)} direction {_numbers(message.direction)}"
+            f"{verb} position {_numbers(message.position)} direction {_numbers(message.direction)}"
         )
     name = f" {message.name}" if message.name else ""
     kind = f" {as_named(Goal, goal).name.lower()}" if goal else ""
-    return f"{what}{name}{kind}"
+    return f"{verb}{name}{kind}"
 
 
 def _numbers(values: np.ndarray) -> str:
+    """Format numbers for a command line."""
     return ", ".join(f"{value:g}" for value in values.tolist())

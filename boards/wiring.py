@@ -11,14 +11,17 @@ from rack.backplane.words import Demand
 from rack.levels.level import LevelContext
 
 Source = str | Mapping[str, str]
-"""What a port reads: a mailbox, or mailboxes by board."""
+"""Source of a port: a mailbox, or mailboxes by board."""
 
 
 Rows = Sequence[tuple[int, int, bytes]]
-"""Messages of a recorded run, oldest first: the tick at which each was written, that of the
-information on which it rests, and its bytes. Of a mailbox that repeats itself only the changes."""
+"""Messages of a mailbox in a recorded run, oldest first.
+
+Each row has the tick at which the message was written, the tick of the information on which it
+depends, and its bytes. A mailbox whose messages repeat has only rows for changes.
+"""
 Entries = Mapping[str, Rows]
-"""What an adapter wrote in a recorded run, by port."""
+"""Messages that an adapter wrote in a recorded run, by port."""
 
 
 def mailboxes_of(source: Source) -> tuple[str, ...]:
@@ -28,8 +31,9 @@ def mailboxes_of(source: Source) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class BusTimes:
-    """A slower bus: minimum processor time of each kind of access, ns; see
-    `[board.<name>.transfer]`.
+    """Minimum processor time of each kind of access in ns, to emulate a slower bus.
+
+    See `[board.<name>.transfer]`.
     """
 
     read_ns: int = 0
@@ -40,9 +44,13 @@ class BusTimes:
 
 @dataclass(frozen=True)
 class SnapshotPolicy:
-    """Snapshots that a rack in lockstep takes: the standstill for them is one part in `part` of its
-    time; 0: it does not matter. Besides, there is one each `every` ticks, unless that is 0, and one
-    before the tick `at`, if that is given.
+    """Policy for the snapshots of a rack in lockstep.
+
+    Attributes:
+        part: Snapshots take at most 1 / `part` of the run's time. 0 for no snapshots by this
+            rule.
+        every: Ticks between additional snapshots, 0 for none.
+        at: Tick before which one more snapshot is taken, None for none.
     """
 
     part: int = 40
@@ -52,11 +60,16 @@ class SnapshotPolicy:
 
 @dataclass(frozen=True)
 class Continuation:
-    """Where a rack in lockstep goes on from: the last snapshot of its crate at `tick` or before.
+    """Point from which a rack in lockstep continues: its crate's last snapshot by `tick`.
 
-    The snapshot has the first `faults` and `commands` of the config in its tables. `losses` are
-    the boards lost in the run that it continues, and when. A task goes on as it is there, with
-    other settings perhaps. If it is wired otherwise it starts anew, from what its mailboxes hold.
+    A task continues as it was in the snapshot, possibly with other settings. If its wiring differs,
+    it starts afresh with the content of its mailboxes.
+
+    Attributes:
+        tick: Latest permitted tick of the snapshot.
+        faults: Number of faults of the config that are in the snapshot's table.
+        commands: Number of commands of the config that are in the snapshot's table.
+        losses: Boards lost in the run that it continues, with the ticks.
     """
 
     tick: int
@@ -67,13 +80,24 @@ class Continuation:
 
 @dataclass(frozen=True)
 class TaskWiring:
-    """One task: its class `target`, as "package.module:Class", and the mailboxes of each port.
+    """Wiring of one task.
 
-    `critical_priority`: SCHED_FIFO priority of a tightly coupled planner during its plan update.
-    `guards_clock`: the task is one of the fastest and watches the clock. `sent`: the ports whose
-    messages the level sends itself. `fails_self_test`: a fault in the config. `entries`: for an
-    adapter in a replay. `exchange`: the ports that are not simply read in every cycle; it makes the
-    task write its mailbox `<board>.exchange`. `reservation`: asked for in place of a priority.
+    Attributes:
+        task: Name of the task.
+        target: Class of its executor or planner, as "package.module:Class".
+        inputs: Mailboxes of each input port.
+        outputs: Mailbox of each output port.
+        context: Context of the level.
+        critical_priority: SCHED_FIFO priority of a tightly coupled planner during its plan
+            update.
+        guards_clock: True for one of the fastest tasks, which watch the clock.
+        sent: Ports whose messages the level sends itself.
+        fails_self_test: True if the config injects a failed self-test.
+        entries: Recorded messages for an adapter in a replay.
+        transfer: Processor time of accesses.
+        exchange: Ports that are not simply read in every cycle. If there are any, the task
+            writes its mailbox `<board>.exchange`.
+        reservation: Processor time requested instead of a priority.
     """
 
     task: str
@@ -93,10 +117,16 @@ class TaskWiring:
 
 @dataclass(frozen=True)
 class HostWiring:
-    """One host board: its program's class, and the mailbox of each port. External: a prompt runs
-    it, not the rack.
+    """Wiring of one host board.
 
-    `computing`: simulated time for which it computes after each wait, in lockstep, ticks.
+    Attributes:
+        board: Name of the board.
+        target: Class of its program.
+        inputs: Mailbox of each input port.
+        outputs: Mailbox of each output port.
+        context: Context of the program.
+        is_external: True if a prompt runs the board, not the rack.
+        computing: Simulated time for which it computes after each wait in lockstep, in ticks.
     """
 
     board: str
@@ -110,14 +140,23 @@ class HostWiring:
 
 @dataclass(frozen=True)
 class ClockWiring:
-    """The clock's board: the course of a run in time. `period_ns` is wall-clock time, including the
-    speed factor.
+    """Wiring of the clock's board. Times are in ticks unless stated otherwise.
 
-    All other times are ticks. The run ends at `stop_tick` (0: never), or `linger` after the status
-    mailbox `ends_run` reports done or error, or if its writer, not lost, has written nothing for
-    `silent`. In lockstep the clock is at most `history` ahead of a recorder, and a lost board
-    rejoins `restart_ticks` after its loss. `on_loss`: the demand on the arm while a task is lost.
-    `keeps_awake`: no core sleeps while it is idle. `reservation`: as of a task.
+    Attributes:
+        lockstep: True for lockstep, False for real time.
+        period_ns: Wall-clock time of a tick, including the speed factor.
+        stop_tick: Tick at which the run ends, 0 for never.
+        ends_run: Status mailbox whose report of done or error ends the run.
+        linger: Time from that report to the end of the run.
+        silent: Time without a message from the writer of `ends_run`, if it is not lost, that
+            ends the run.
+        history: Maximum lead of the clock over a recorder in lockstep.
+        core: Processor core.
+        priority: SCHED_FIFO priority.
+        keeps_awake: True if idle cores must not sleep.
+        restart_ticks: Time from the loss of a board to its rejoining in lockstep.
+        on_loss: Demand on the arm while a task is lost.
+        reservation: Processor time requested instead of a priority.
     """
 
     lockstep: bool

@@ -15,6 +15,7 @@ the functions that it calls.
 
 from __future__ import annotations
 
+import ctypes
 import errno
 import os
 import pickle
@@ -70,8 +71,11 @@ class compiled(Generic[_P, _R]):  # noqa: N801  # a decorator
         It is compiled, or read from the cache, at its first call with given argument types.
         """
         if self._machine is None:
-            self._machine = _jit(self)
+            self._machine = self._build()
         return self._machine
+
+    def _build(self) -> Any:
+        return _jit(self)
 
     def preload(self) -> None:
         """Load the machine code for the types given in `compiled_for`, if any."""
@@ -101,6 +105,34 @@ class compiled(Generic[_P, _R]):  # noqa: N801  # a decorator
             if name in known:
                 yield name.encode()
                 yield from _value(known[name])
+
+
+class c_function(compiled[..., Any]):  # noqa: N801  # stands for a function
+    """A function of a C library whose arguments are integers: addresses, sizes and flags.
+
+    Compiled code finds it by its name, Python through ctypes. The result is a signed word, without
+    meaning if the function returns nothing.
+    """
+
+    def __init__(self, library: str, name: str, arguments: int) -> None:
+        function = getattr(ctypes.CDLL(library), name)
+        function.restype = ctypes.c_ssize_t
+        function.argtypes = [ctypes.c_ssize_t] * arguments
+        super().__init__(function)
+        self._key = name, arguments
+        self._library = library
+
+    def source(self) -> Iterator[bytes]:
+        """Yield what a caller's code depends on: it finds the function by name."""
+        yield repr(self._key).encode()
+
+    def _build(self) -> Any:
+        from llvmlite import binding
+        from numba import types
+
+        binding.load_library_permanently(self._library)
+        name, arguments = self._key
+        return types.ExternalFunction(name, types.intp(*[types.intp] * arguments))
 
 
 def compiled_for(

@@ -1,1 +1,1 @@
-"""The common clock: releases, waiting, and what watches whether it runs."""
+"""The system clock: ticks, releases, waits, and checks that it is running."""

@@ -1,16 +1,16 @@
-"""The clock in lockstep: a tick begins when every task due before it has finished. Exact,
-repeatable, and fast.
+"""The clock in lockstep: a tick begins when every task due before it has finished.
 
-Tasks on different cores run at once. Each reports by a semaphore of its own, and the clock waits
-for one of them at a time, first for the one that finished last in the tick before: the reports of
-the others are then there, and the clock wakes up once in a tick. Alternatives considered: one
-semaphore for all (the clock wakes up for every report, and takes the core from a task that still
-works), and a word that names the awaited task (it needs a memory barrier on each side).
+Tasks on different cores run at once. Each reports through a separate semaphore. The clock waits for
+one of them at a time, beginning with the task that finished last in the tick before. The reports of
+the others have usually arrived by then, so the clock wakes up once in a tick. Alternatives
+considered: one semaphore for all (the clock wakes up for every report and takes the core from a
+task that is still working), and a word that names the awaited task (it needs a memory barrier on
+each side).
 
-An executor that alone is due in the next ticks gets their releases as one batch. Each tick of its
-own would cost two switches and the clock's work, together a fifth of a tick of `k1607`. In a batch
-no other task is released, no message of another one becomes visible, and the clock itself has
-nothing to do: so the executor reads and writes the same.
+If a single executor is the only task due in the next ticks, it gets their releases as one batch.
+Separate ticks would each cost two switches and the clock's work, together a fifth of a tick of
+`k1607`. In a batch no other task is released, no message of another task becomes visible, and the
+clock has nothing to do, so the executor reads and writes the same messages.
 """
 
 from __future__ import annotations
@@ -28,24 +28,25 @@ from rack.backplane.watch.alarms import AlarmWriter
 from rack.backplane.words import Run, System
 
 IDLE_S = 30.0
-"""Bound of the wait for a recorder that is stopped, or dead and not replaced. Its launcher replaces
-it much sooner."""
+"""Maximum wait for a recorder that is stopped, or dead and not replaced.
+
+Its launcher replaces it much sooner.
+"""
 BATCH = 8
-"""Most ticks of a batch: what the host asks for meanwhile comes after them."""
+"""Maximum number of ticks in a batch. Requests of the host in between take effect after it."""
 LOOK_S = 0.001
-"""Time between looks at what posts no semaphore: recorder and host, which must not be able to
-disturb the clock."""
+"""Time between checks of recorder and host.
+
+They post no semaphore, because they must not be able to disturb the clock.
+"""
 
 
 class LockstepDriver(ClockDriver):
-    """The driver of the clock in lockstep.
+    """Driver of the clock in lockstep.
 
-    `snapshot` is called before every tick, or batch, to take a snapshot when one is due; it returns
-    the next tick before which it must be called. At first it takes none.
-
-    `one_at_a_time` releases the tasks of a tick one after the other, planners too, and waits for
-    each. Protocols whose messages are visible at once need this to be repeatable; so does a task
-    that floods a mailbox, since messages that others still read are overwritten in the same tick.
+    Attributes:
+        snapshot: Function called before every tick, or batch, to take a snapshot if one is due.
+            It returns the next tick before which it must be called. Initially it does nothing.
     """
 
     def __init__(
@@ -56,6 +57,18 @@ class LockstepDriver(ClockDriver):
         history_ticks: int,
         alarms: AlarmWriter | None = None,
     ) -> None:
+        """Create the driver.
+
+        Args:
+            segment: Memory of the rack.
+            ended: Returns the tick at which the run stops, once known.
+            one_at_a_time: True to release the tasks of a tick one after the other, including
+                planners, and to wait for each. Runs under protocols whose messages are visible
+                at once repeat only this way. A task that floods a mailbox also needs it,
+                because messages that others still read would be overwritten in the same tick.
+            history_ticks: Number of ticks that the rings hold for a recorder that is behind.
+            alarms: Alarm ring of the clock, opened if None.
+        """
         super().__init__(segment, ended, alarms)
         self._one_at_a_time = one_at_a_time
         self._history_ticks = history_ticks
@@ -67,13 +80,13 @@ class LockstepDriver(ClockDriver):
 
     @property
     def first_end(self) -> int:
-        """The next tick: a run that continues another may begin after its end."""
+        """The next tick. A run that continues another may begin after its end."""
         return self._next
 
     def run(self) -> None:
-        """Make ticks until the run is over or the launcher is gone."""
+        """Make ticks until the run is over or the launcher has ended."""
         self.words[System.STATE] = Run.RUNNING
-        # A clock that was restarted does not know where a batch ends.
+        # A restarted clock does not know the end of a batch.
         self.settle()
         while self._begins(tick := self._next):
             if not self.begin(tick):
@@ -88,22 +101,24 @@ class LockstepDriver(ClockDriver):
         self.end()
 
     def _begins(self, tick: int) -> bool:
-        """Say whether `tick` begins, after whatever must be waited for before it."""
-        # Nothing has looked at this tick yet: what goes on from here begins with it.
+        """Wait for everything that `tick` must wait for. Returns False if the run ends."""
+        # Nothing has been done for this tick yet, so a run that continues from the snapshot begins
+        # with it.
         self._snapshot_at = self.snapshot(tick)
         return (
             self._wait_for_step(tick) and not self.is_over(tick) and self._wait_for_follower(tick)
         )
 
     def _batch_end(self, due: list[ReleasedTask], tick: int) -> int:
-        """Return the tick before which nothing happens but cycles of the one executor that is due;
-        the next one if there is more to do.
+        """Return the tick before which nothing happens except cycles of the only executor due.
+
+        The result is the next tick if there is more to do.
         """
         controller = self.controller
         if len(due) != 1 or controller is None or self._one_at_a_time:
             return tick + 1
         (alone,) = due
-        # Within the cycles of a slower one there are ticks that do not wait for it.
+        # During the cycle of a slower executor there are ticks that do not wait for it.
         if alone.spec.every > 1 or alone.spec.role != "executor" or alone.is_stopped:
             return tick + 1
         words = self.words
@@ -120,7 +135,11 @@ class LockstepDriver(ClockDriver):
         return max(end, tick + 1)
 
     def _step(self, due: list[ReleasedTask], tick: int, end: int) -> bool:
-        """Do one tick, or a batch before `end`; False when the launcher is gone."""
+        """Run one tick, or a batch that ends before `end`.
+
+        Returns:
+            False if the launcher has ended.
+        """
         one_at_a_time = self._one_at_a_time or self.is_flooded
         for task in due:
             task.release(tick, end - tick - 1)
@@ -136,7 +155,7 @@ class LockstepDriver(ClockDriver):
             if task.deadline > end:
                 continue
             if task.is_finished(end):
-                # Its report is taken even so: else the semaphore would overflow.
+                # Take its report all the same. Otherwise the semaphore would overflow.
                 task.done.take()
             else:
                 slowest = task
@@ -148,34 +167,41 @@ class LockstepDriver(ClockDriver):
         return True
 
     def settle(self) -> None:
-        """Wait until every task has finished the work of its release, plans too."""
+        """Wait until every task has finished the work of its release, including plans."""
         for task in self.tasks:
             self.await_state(task, task.is_settled)
 
     def await_state(self, task: ReleasedTask, condition: Callable[[], bool]) -> bool:
-        """Wait until `condition` holds, which the task's reports make true; False when the launcher
-        is gone.
+        """Wait until a condition on the state of a task holds.
+
+        Args:
+            task: Task whose reports make the condition true.
+            condition: Function that is called after each report.
+
+        Returns:
+            False if the launcher has ended.
         """
         wait = task.done.wait
         while not condition():
-            # The bound may be that of an earlier wait: a timeout that comes early costs one look
-            # around, no more.
+            # The bound may stem from an earlier wait. A timeout that comes early only costs one
+            # extra check.
             if wait() and not self._look_around(task):
                 return False
         return True
 
     def _look_around(self, task: ReleasedTask) -> bool:
-        """Check for a stopped task after a wait without a report; False when the run must end."""
+        """Check for a stopped task after a wait without a report. Returns False to end the run."""
         if not self.launcher_is_alive or self.words[System.STOP_REQUEST]:
             return False
-        # A signal may have stopped it: time must not wait for it.
+        # A signal may have stopped the process, and lockstep must not wait for it.
         task.check_stopped()
         task.done.bind(time.monotonic_ns() + int(CHECK_S * 1e9))
         return True
 
     def _wait_for_follower(self, tick: int) -> bool:
-        """Wait for a recorder, however slow, before its rings overflow: in lockstep time stands
-        still meanwhile.
+        """Wait for a recorder, however slow, before its rings overflow.
+
+        In lockstep no time passes for the rack during this wait.
         """
         words = self.words
         since = time.monotonic()
@@ -190,15 +216,20 @@ class LockstepDriver(ClockDriver):
         return True
 
     def _is_ahead(self, tick: int) -> bool:
-        """Say whether the recorder must catch up first; rings that are flooded hold little more
-        than a tick.
+        """Check whether the recorder must catch up before `tick`.
+
+        Flooded rings hold little more than one tick.
         """
         if self.is_flooded and self.words[System.FOLLOWER_DRAINED] < tick - 1:
             return True
         return self.words[System.FOLLOWER_TICK] < tick - self._history_ticks
 
     def _wait_for_step(self, tick: int) -> bool:
-        """Hold before `tick` while the host steps the rack; False when the launcher is gone."""
+        """Hold before `tick` while the host single-steps the rack.
+
+        Returns:
+            False if the launcher has ended.
+        """
         words = self.words
         if not 0 < words[System.HOLD_AT] <= tick + 1:
             return True

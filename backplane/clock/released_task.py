@@ -1,9 +1,9 @@
-"""A task as the clock sees it, and the watchdog that finds tasks not responding to their releases.
+"""A task as the clock sees it, and the watchdog for tasks that do not respond to releases.
 
-A missed release does not prove a fault: on a busy machine any process may be preempted for a while.
-A task is lost only with proof: a signal has stopped its process, or it waits for something other
-than its release, or it has used so much processor time that it will not end. A task that gets no
-processor time is starved.
+A missed release does not prove a fault, because on a busy machine any process may be preempted for
+a while. A task counts as lost only with proof: a signal has stopped its process, or it waits for
+something other than its release, or it has used so much processor time that it will not end. A task
+that gets no processor time is starved.
 """
 
 from __future__ import annotations
@@ -18,22 +18,28 @@ from rack.backplane.watch.alarms import Alarm, AlarmWriter
 from rack.backplane.words import Block, TaskState
 
 RELEASES_MISSED = 4
-"""Missed releases before a task is checked: three gave one false trip in 24,000 cycles at 400
-Hz."""
+"""Number of missed releases before a task is checked.
+
+Three gave one false alarm in 24,000 cycles at 400 Hz.
+"""
 LEAST_NS = 1_000_000_000
-"""Least processor time, or waiting time, before a task counts as hanging."""
+"""Minimum processor time, or waiting time, before a task counts as hanging."""
 
 
 class ReleasedTask:
-    """The clock's end of a task's control block.
+    """The clock's access to a task's control block.
 
-    `index` is its place in the layout. `sleeps`: in real time it sleeps to its grid points by
-    itself. `is_posted`: it waits for its semaphore, which `wake()` posts. `done`: the semaphore
-    that it posts in lockstep. `missed` counts releases since it last finished one: 1 when it
-    becomes late, 2 while it finishes each one late, more while it finishes none. `deadline`: tick
-    before which its release, or plan, must be finished, or its messages are sent, as last seen; it
-    only moves later. `is_stopped`: a signal has stopped its process, so lockstep must not wait for
-    it.
+    Attributes:
+        index: Index of the task in the layout.
+        sleeps: True if it sleeps to its grid points by itself in real time.
+        is_posted: True if it waits for its semaphore, which `wake()` posts.
+        done: Semaphore that it posts in lockstep.
+        missed: Releases since it last finished one: 1 when it becomes late, 2 while it finishes
+            each release late, more while it finishes none.
+        deadline: Tick before which its release or plan must be finished, or its messages sent,
+            as last read. It only moves later.
+        is_stopped: True if a signal has stopped its process, so that lockstep must not wait for
+            it.
     """
 
     def __init__(self, segment: Segment, spec: TaskSpec) -> None:
@@ -53,14 +59,20 @@ class ReleasedTask:
         self.done = done_semaphore(segment, spec.name)
 
     def is_free(self, release: int) -> bool:
-        """Say whether the task can take a release; it cannot while it works on a plan or is
-        lost.
+        """Check whether the task can take a release.
+
+        It cannot while it works on a plan or is lost.
         """
         block = self.block
         return block[Block.DEADLINE] <= release and not self.is_lost
 
     def release(self, tick: int, more: int = 0) -> None:
-        """Give the task its newest release and, in lockstep, so many `more` after it."""
+        """Give the task its newest release.
+
+        Args:
+            tick: Current tick.
+            more: Number of releases after this one that the task gets as well, in lockstep.
+        """
         block = self.block
         every = self._every
         release = tick - (tick - self._phase) % every
@@ -81,18 +93,18 @@ class ReleasedTask:
         block[Block.RELEASED] = newest
 
     def next_event(self, tick: int) -> int:
-        """Return the first tick after `tick` that must wait for the task, or releases it."""
+        """Return the first tick after `tick` that must wait for the task or releases it."""
         if self.deadline > tick:
             return self.deadline
         return tick + 1 + (self._phase - tick - 1) % self._every
 
     def is_settled(self) -> bool:
-        """Say whether it has finished, or will not: there is nothing to wait for."""
+        """Check whether nothing needs to wait for the task: it has finished or never will."""
         block = self.block
         return block[Block.DONE] == block[Block.RELEASED] or self.is_lost or self.is_stopped
 
     def is_finished(self, tick: int) -> bool:
-        """Say whether `tick` may begin without waiting for the task."""
+        """Check whether `tick` may begin without waiting for the task."""
         self.deadline = self.block[Block.DEADLINE] - self._early
         return self.deadline > tick or self.is_settled()
 
@@ -102,33 +114,34 @@ class ReleasedTask:
 
     @property
     def is_lost(self) -> bool:
-        """Whether the task was found lost and has not rejoined."""
+        """True if the task was found lost and has not rejoined."""
         return bool(self.block[Block.LOST])
 
     @property
     def lost_tick(self) -> int:
-        """Tick at which a lost task was found so."""
+        """Tick at which a lost task was found lost."""
         return self.block[Block.LOST] - 1
 
     @property
     def is_ready(self) -> bool:
-        """Whether a lost task's new process waits for its first release; that of a host board may
-        be done already.
+        """True if the new process of a lost task waits for its first release.
+
+        The process of a host board may have ended already.
         """
         return self.block[Block.STATE] in (TaskState.READY, TaskState.RUNNING, TaskState.ENDED)
 
     @property
     def is_given_up(self) -> bool:
-        """Whether a lost task will not be restarted."""
+        """True if a lost task will not be restarted."""
         return self.block[Block.STATE] == TaskState.GIVEN_UP
 
     def lose(self, tick: int) -> None:
-        """Stop releasing it until its new process has rejoined."""
+        """Stop releasing the task until its new process has rejoined."""
         self.block[Block.STATE] = TaskState.ABSENT
         self.block[Block.LOST] = tick + 1
 
     def rejoin(self) -> None:
-        """Admit its new process: the next release on the grid is its first."""
+        """Admit the task's new process. The next release on the grid is its first."""
         block = self.block
         block[Block.DONE] = block[Block.RELEASED]
         block[Block.DEADLINE] = 0
@@ -138,14 +151,15 @@ class ReleasedTask:
 
 
 def by_priority(layout: Layout) -> list[TaskSpec]:
-    """Return the tasks in the order in which the clock releases them: executors by rate, then
-    planners.
+    """Return the tasks in the order in which the clock releases them.
+
+    Executors come first, by rate, followed by planners.
     """
     return sorted(layout.tasks, key=lambda t: (t.role == "planner", t.every, t.phase, t.slot))
 
 
 class Watchdog:
-    """Checks tasks that miss releases. `losses` counts the tasks found hanging."""
+    """Watchdog for tasks that miss releases. `losses` counts the tasks found hanging."""
 
     def __init__(self, alarms: AlarmWriter, period_ns: int) -> None:
         self._alarms = alarms
@@ -154,9 +168,7 @@ class Watchdog:
         self._used_ns: dict[int, int] = {}  # task -> processor time when it was first checked
 
     def check(self, task: ReleasedTask, tick: int) -> None:
-        """Raise the alarms for a task that has missed a release by `tick`, and find out whether it
-        hangs.
-        """
+        """Check a task that has missed a release by `tick`, and raise its alarms."""
         missed = task.missed
         spec = task.spec
         if missed == 1:
@@ -174,6 +186,7 @@ class Watchdog:
             self._alarms.ring(tick, Alarm.STARVED, task.index, missed, tick - missed * spec.every)
 
     def _hangs(self, task: ReleasedTask) -> bool:
+        """Check whether a task that has missed several releases is proved to hang."""
         spec = task.spec
         pid = task.block[Block.PID]
         state = state_of(pid)

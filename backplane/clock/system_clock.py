@@ -11,7 +11,7 @@ from rack.backplane.words import Run, System
 
 
 class SystemClock:
-    """Read access to the clock: the current tick, and the times of ticks on CLOCK_MONOTONIC."""
+    """Read access to the current tick and to the times of ticks on CLOCK_MONOTONIC."""
 
     def __init__(self, segment: Segment) -> None:
         self._words = segment.words
@@ -19,17 +19,19 @@ class SystemClock:
 
     @property
     def tick(self) -> int:
-        """The newest tick of the clock board."""
+        """Newest tick of the clock board."""
         return self._words[System.TICK]
 
     @property
     def is_stopped(self) -> bool:
-        """True when the run is over."""
+        """True if the run is over."""
         return self._words[System.STATE] == Run.STOPPED
 
     def now(self) -> int:
-        """Return the current tick: in real time by the grid, as the clock board may be late; else
-        the newest tick.
+        """Return the current tick.
+
+        In real time it is computed from the grid, because the clock board may be late. In lockstep
+        it is the newest tick.
         """
         if self.is_lockstep:
             return self._words[System.TICK]
@@ -41,7 +43,7 @@ class SystemClock:
         return self._words[System.PERIOD_NS]
 
     def time_of(self, tick: int) -> int:
-        """Return the CLOCK_MONOTONIC time of a tick, in ns."""
+        """Return the time of a tick, in ns of CLOCK_MONOTONIC."""
         return self._words[System.EPOCH_NS] + tick * self._words[System.PERIOD_NS]
 
 
@@ -52,28 +54,28 @@ def ticks_of(
     of: tuple[str, str] = ("clock", "tick"),
     fastest_hz: float = inf,
 ) -> int:
-    """Return the period, in ticks, of a rate.
+    """Convert a rate to a period in ticks.
 
     Args:
-        rate_hz: Rate; rounded to four digits or more, as in 57.14 Hz for 400 Hz / 7.
+        rate_hz: Rate, rounded to four digits or more, such as 57.14 Hz for 400 Hz / 7.
         clock_ns: Length of a tick.
-        what: Name of what has the rate, for the error.
-        of: The error's words for the grid and for one step of it.
-        fastest_hz: Highest rate that the error may suggest.
+        what: Name of the thing that has the rate, for the error message.
+        of: Words of the error message for the grid and for one step of it.
+        fastest_hz: Highest rate that the error message may suggest.
 
     Raises:
-        ClockError: The rate is off the grid; the error names the nearest rates.
+        ClockError: The rate is off the grid. The error names the nearest rates.
     """
     clock_hz = 1e9 / clock_ns
     grid, step = of
-    # Infinite, too, for a rate so low that the quotient has no number.
+    # The quotient is also infinite if the rate is extremely low.
     ticks = clock_hz / rate_hz if rate_hz > 0 else inf
     if ticks == inf:
         raise ClockError(
-            f"{what}: {rate_hz:g} Hz is not a rate; permitted: {clock_hz:g} Hz divided by a whole"
-            " number"
+            f"{what}: {rate_hz:g} Hz is not a rate; valid rates are {clock_hz:g} Hz divided by a"
+            " whole number"
         )
-    # Above the clock's own rate there is only one neighbour.
+    # A rate above the clock's rate has only one neighbour.
     nearest = {n: rate_text(clock_hz / n) for n in (int(ticks) + 1, int(ticks)) if n >= 1}
     for every in sorted(nearest, key=lambda n: abs(n - ticks)):
         if abs(ticks - every) <= 1e-6 * ticks or rate_hz == float(nearest[every]):
@@ -89,5 +91,5 @@ def ticks_of(
 
 
 def rate_text(rate_hz: float) -> str:
-    """Return a rate, Hz, with the digits that `ticks_of` needs to find its period."""
+    """Format a rate in Hz with the digits that `compute_period_ticks` needs to find its period."""
     return f"{rate_hz:.4g}"

@@ -1,16 +1,16 @@
 """Waiting for the next cycle: `waituntil(next-cycle)` of the paper's pseudo-code.
 
-"timer": the task sleeps to its own grid point and finds its release there, since the clock works a
-little ahead of the grid (`rack.backplane.clock.driver`). Its lateness is then that of one wake-up,
-not of two in a row (clock, then task). If the release is missing, the clock is late, stopped, or
-has skipped a tick: the task sleeps on to its next grid point, and the late clock wakes it with a
-post. A sleep of more than `NEAR_NS` is a wait for the task's semaphore with the grid point as its
-bound, so that the end of a run ends it; a shorter one takes less processor time.
+"timer": the task sleeps until its next grid point and finds its release in place, because the clock
+works a little ahead of the grid (`rack.backplane.clock.driver`). Its lateness is then the lateness
+of one wake-up, not of two in a row (clock, then task). If the release is missing, the clock is
+late, stopped, or has skipped a tick. The task sleeps until its next grid point, and the late clock
+wakes it with a post. A sleep of more than `MAX_SLEEP_NS` is a wait for the task's semaphore until
+the grid point, so that the end of a run ends it. A shorter sleep takes less processor time.
 
 "signal": the task blocks on its semaphore until the clock posts it at the grid point.
 
-"poll": a task with its own core busy-waits for its release, if a context switch is too large a part
-of its cycle.
+"poll": a task with a dedicated core busy-waits for its release, for cycles in which a context
+switch would take too large a share.
 
 In lockstep there is no grid: a task that would sleep is woken by a signal.
 """
@@ -31,27 +31,35 @@ from rack.backplane.words import Block, Run, System
 # Plain integers for the hot path.
 _STOPPED = int(Run.STOPPED)
 CHECK_S = 0.25
-"""A longer wait checks whether the launcher is still alive."""
+"""Time after which a wait checks whether the launcher is still alive."""
 NEAR_NS = 25_000_000
-"""Longest sleep that nothing can end."""
+"""Longest sleep that cannot be interrupted."""
 SPINS = 100_000
-"""Polls of the release between two checks of the launcher: some milliseconds."""
+"""Number of polls between two checks of the launcher, which take some milliseconds."""
 
 
 class NextCycle:
-    """The releases of one task, on the grid. A late task skips the releases that passed, and counts
-    them.
+    """Releases of one task on the grid. A late task skips the releases that passed.
 
-    An executor's release has passed at the next one; those that the clock gives at once in lockstep
-    are taken one after the other. A planner's has passed at the end of its plan's time slice: until
-    then it is taken late, as of its own tick, since its result depends on ticks alone.
+    An executor's release has passed at the next release, except that releases given at once in
+    lockstep are taken one after the other. A planner's release has passed at the end of its plan's
+    time slice. Until then it is taken late, as of its tick, because its result depends on ticks
+    alone.
+
+    Attributes:
+        skipped: Number of releases that passed before the last one taken.
     """
 
     def __init__(
         self, segment: Segment, task: str, clock_alarms: AlarmWriter | None = None
     ) -> None:
-        """Wait for the releases of `task`; with `clock_alarms`, check a silent clock and raise an
-        alarm there.
+        """Wait for the releases of a task.
+
+        Args:
+            segment: Memory of the rack.
+            task: Name of the task.
+            clock_alarms: Ring for the alarm about a silent clock. None to leave the clock
+                unchecked.
         """
         self._spec = spec = segment.layout.task(task)
         self._words = segment.words
@@ -73,40 +81,40 @@ class NextCycle:
         self._silent_clock = (
             None if is_lockstep or clock_alarms is None else SilentClock(segment, clock_alarms)
         )
-        # A restarted task takes no release from before its start: those are skipped. The clock does
-        # not write this word until the task has rejoined.
+        # A restarted task skips the releases before its start. The clock does not write this word
+        # until the task has rejoined.
         self._block[Block.RELEASED] = self._block[Block.DONE]
         self._due = self._block[Block.DONE] + 1
         self.hold_until(self._due)
         self._slack = 0
         self.skipped = 0
         self.copy: Callable[[], None] | None = None
-        """Called when the clock wants a copy of the task, between two cycles."""
+        """Function called between two cycles when the clock wants a copy of the task."""
 
     def wait(self) -> int | None:
-        """Wait for the next release and return its tick; None when the run is over and every
-        release was taken.
+        """Wait for the next release, and set `skipped`.
 
-        Sets `skipped` to the releases that passed since the last one.
+        Returns:
+            The release tick. None if the run is over and every release has been taken.
         """
         words = self._words
         block = self._block
         is_posted = self._is_posted
         while True:
-            # Read first: a task that is late for the run's last release still takes it, so that the
-            # miss is seen.
+            # Read this first. A task that is late for the run's last release then still takes it,
+            # so that the miss is noticed.
             is_over = words[System.STATE] == _STOPPED
-            # The task's own release, not the clock's tick: in lockstep its turn may come later in a
-            # tick.
+            # Read the task's release, not the clock's tick, because in lockstep the task may be
+            # released later in a tick.
             newest = block[Block.RELEASED]
             if self._sleeps and newest >= self._due and self._is_ahead(newest):
-                # A task woken late may find the next release there already: the one before it is
-                # still to be taken.
+                # A task woken late may find that the next release has been given too. The previous
+                # one must be taken first.
                 newest -= self._spec.every
             if newest >= self._due:
                 if is_posted and newest != self._newest:
-                    # Its post, which nobody waited for: else the semaphore would overflow within
-                    # weeks. A batch has one.
+                    # Take the post of this release, or of its batch, for which the task has not
+                    # waited. Otherwise the semaphore would overflow within weeks.
                     self._semaphore.take()
                 self._newest = newest
                 return self._take(newest)
@@ -130,20 +138,21 @@ class NextCycle:
         return release
 
     def _is_ahead(self, release: int) -> bool:
-        """Say whether the grid point of a release is yet to come."""
+        """Check whether the grid point of a release is still to come."""
         return (
             monotonic_ns() < self._words[System.EPOCH_NS] + release * self._words[System.PERIOD_NS]
         )
 
     def _sleep(self) -> bool:
-        """Sleep to the next release's grid point or, if that has passed, to the task's next one or
-        a late release.
+        """Sleep until the grid point of the next release.
+
+        If that has passed, sleep until the task's next grid point or a late release.
         """
         words = self._words
         now = monotonic_ns()
         deadline = bound = now + int(CHECK_S * 1e9)
         is_due = False
-        # Before its start the clock has no grid. It then wakes every task once.
+        # The clock has no grid before its start, at which it wakes every task once.
         if epoch := words[System.EPOCH_NS]:
             point = epoch + self._due * words[System.PERIOD_NS]
             step = self._spec.every * words[System.PERIOD_NS]
@@ -160,14 +169,16 @@ class NextCycle:
         return self._look_around()
 
     def _await_post(self) -> bool:
-        # The bound may be that of an earlier wait: a timeout that comes early costs one look
-        # around, no more.
+        # The bound may stem from an earlier wait. A timeout that comes early only costs one extra
+        # check.
+        """Wait for the semaphore in lockstep. Returns False if the launcher has ended."""
         if not self._semaphore.wait():
             return True
         self._semaphore.bind(monotonic_ns() + int(CHECK_S * 1e9))
         return self._look_around()
 
     def _block_on_semaphore(self) -> bool:
+        """Wait for the semaphore in real time. Returns False if the launcher has ended."""
         bound = int(CHECK_S * 1e9)
         if self._silent_clock is not None and self._has_begun:
             bound = min(bound, self._silent_clock.patience_ns(self._due))
@@ -175,6 +186,7 @@ class NextCycle:
         return not self._semaphore.wait() or self._look_around()
 
     def _spin(self) -> bool:
+        """Poll for the release. Returns False if the launcher has ended."""
         block = self._block
         due = self._due
         for _ in range(SPINS):
@@ -184,30 +196,36 @@ class NextCycle:
         return self._segment.launcher_is_alive
 
     def _look_around(self) -> bool:
-        """Check the clock, after a wait without a release; return False if the launcher is gone."""
+        """Check the clock after a wait without a release.
+
+        Returns:
+            False if the launcher has ended.
+        """
         if self._silent_clock is not None and self._has_begun:
             self._silent_clock.check()
         return self._segment.launcher_is_alive
 
     @property
     def _has_begun(self) -> bool:
-        """Whether a release is past: before the first one the clock may not have started."""
+        """True if a release has passed. Before the first one the clock may not have started."""
         return self._due > self._spec.phase
 
     def hold_until(self, tick: int) -> None:
-        """Take no release before `tick`: a planner keeps the time slice of its plan."""
+        """Take no release before `tick`. A planner keeps the time slice of its plan this way."""
         self._due = max(self._due, self._spec.grid.since(tick))
 
 
 CLOCK_TICKS = 2
 """Ticks after a missing release before the clock is checked."""
 CLOCK_SILENT_S = 0.5
-"""Time without a tick before the clock counts as stopped while its process waits: it cannot be
-waiting for a tick."""
+"""Time without a tick after which a clock whose process waits counts as stopped.
+
+Such a clock cannot be waiting for a tick.
+"""
 
 
 class SilentClock:
-    """One task's check of a clock that makes no ticks. A late clock is not at fault."""
+    """A task's check of a clock that makes no ticks. A late clock is not reported."""
 
     def __init__(self, segment: Segment, alarms: AlarmWriter) -> None:
         self._words = segment.words
@@ -217,20 +235,20 @@ class SilentClock:
         self._waited_at = -1
 
     def has_ticked(self) -> None:
-        """Note a release: the next silence is a new one."""
+        """Record a release, which ends an episode of silence."""
         self._is_reported = False
 
     def patience_ns(self, expected: int) -> int:
-        """Return how long to wait, ns, before the next check, if the next release is that of tick
-        `expected`.
+        """Return the time to wait before the next check, in ns.
+
+        Args:
+            expected: Tick of the next release.
         """
         late = self._clock.time_of(expected + CLOCK_TICKS) - monotonic_ns()
         return late if late > 0 else CLOCK_TICKS * self._clock.period_ns
 
     def check(self) -> None:
-        """Raise one alarm for a clock that makes no ticks: its process is stopped, dead, or silent
-        for too long.
-        """
+        """Raise one alarm if the process of the clock is stopped, dead, or silent for too long."""
         now = self._clock.now()
         newest = self._words[System.TICK]
         if now - newest < CLOCK_TICKS:
@@ -239,12 +257,12 @@ class SilentClock:
         silent_s = (now - newest) * self._clock.period_ns * 1e-9
         clock = self._words[System.CLOCK_PID]
         state = state_of(clock)
-        # A clock that could run is only late. Twice: after a pause of the whole machine it may be
-        # about to wake.
+        # A clock that could run is only late. Check a waiting one twice, because after a pause of
+        # the whole machine it may be about to wake.
         waits = silent_s > CLOCK_SILENT_S and state in WAITING
         has_stopped = state in STOPPED + GONE or (waits and self._waited_at == newest)
         self._waited_at = newest if waits else -1
-        # A new tick, or the end of the run, disproves it.
+        # A new tick, or the end of the run, proves that the clock was running.
         if (
             has_stopped
             and not self._is_reported

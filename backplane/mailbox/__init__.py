@@ -1,1 +1,1 @@
-"""Mailboxes in shared memory: one writer, any number of readers, and their histories."""
+"""Mailboxes: slots, readers, writers and the protocols that decide visibility."""

@@ -1,10 +1,10 @@
-"""The messages of a mailbox as the host side reads them: in blocks, and as the digest of a run.
+"""Messages of a mailbox for the host side: in blocks, and as the digest of a run.
 
 The digest is a hash over everything that every task wrote: ticks and values, no wall-clock time.
-Each message carries the chain of its mailbox, so the digest is complete even if a recorder lost
-rows, and a restarted writer continues it. Messages that become visible after the last tick do not
-count: nothing reads them, and whether they are written before the run ends depends on timing. The
-mailboxes of host boards do not count either: they are not written at ticks.
+Each message carries the chained checksum of its mailbox, so the digest is complete even if a
+recorder lost rows, and a restarted writer continues it. Messages that become visible after the last
+tick do not count: they are never read, and whether they are written before the run ends depends on
+timing. The mailboxes of host boards do not count either, because they are not written at ticks.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ HEAD_WORDS = {
     "tick": "i8",
     "visible_at": "i8",
 }
-"""The words of `words.Slot` in their order, with their types."""
+"""Words of `words.Slot` in their order, with their types."""
 
 
 class MailboxRing(Ring):
-    """The messages of a mailbox as a ring: `HEAD_WORDS`, then `message`.
+    """Messages of a mailbox as a ring of rows with the fields of `HEAD_WORDS` and `message`.
 
     It omits the messages that every reader rejects: lost, damaged or forged ones.
     """
@@ -51,7 +51,7 @@ class MailboxRing(Ring):
         self._covered = slice(CHECKED_FROM, SLOT_HEAD_SIZE + spec.size)
 
     def drain(self) -> Drained:
-        """Take every good message written since the last call."""
+        """Read every good message written since the last call."""
         rows, lost = super().drain()
         if not len(rows):
             return Drained(rows, lost)
@@ -60,12 +60,12 @@ class MailboxRing(Ring):
         signatures = rows["epoch"]
         lawful = (signatures == holder) | ((signatures & EPOCH_MASK) < epoch_of(holder))
         if not lawful[-1]:
-            # The writer does not know of this message, and will write its own in that place.
+            # This message was forged. The lawful writer will overwrite it, so read the row again.
             self._taken -= 1
         covered = rows.view(np.uint8).reshape(len(rows), self._stride)[:, self._covered]
         checks = (
-            xxh3(part.tobytes(), chain)
-            for part, chain in zip(covered, rows["chain"].tolist(), strict=True)
+            xxh3(content.tobytes(), chain)
+            for content, chain in zip(covered, rows["chain"].tolist(), strict=True)
         )
         good = (
             lawful
@@ -78,7 +78,7 @@ class MailboxRing(Ring):
 
 
 def row_dtype(spec: MailboxSpec) -> np.dtype:
-    """Return the type of one row of a mailbox's ring, padding included."""
+    """Return the type of one row of a mailbox's ring, including padding."""
     message = message_dtype(spec.fields, spec.size)
     return np.dtype(
         {
@@ -91,27 +91,33 @@ def row_dtype(spec: MailboxSpec) -> np.dtype:
 
 
 def chains(segment: Segment, until: int) -> dict[str, tuple[int, int]]:
-    """Return serial and chain of every timed mailbox's newest message that was visible before tick
-    `until`.
+    """Return serial and chained checksum of the newest message of every timed mailbox.
+
+    Args:
+        segment: Memory of the rack.
+        until: Only messages that were visible before this tick count.
     """
-    found = {}
+    chain_by_mailbox = {}
     for spec in segment.layout.timed:
         slots = Slots(segment, spec)
         serial = head = slots.box[Box.HEAD]
         oldest = max(0, head - slots.depth)
-        # A lost, damaged or forged message has no valid chain: the one before it has.
+        # A lost, damaged or forged message has no valid chain, so use an earlier message.
         while serial > oldest and not (
             slots.visible_at(serial) < until and slots.fetch(serial) and slots.is_lawful(0)
         ):
             serial -= 1
         chain = slots.chain if serial > oldest else 0
-        found[spec.name] = (serial, chain)
-    return found
+        chain_by_mailbox[spec.name] = (serial, chain)
+    return chain_by_mailbox
 
 
 def digest(segment: Segment, until: int | None = None) -> str:
-    """Return the run's digest, 32 hexadecimal digits, up to tick `until` (default: where it
-    stopped).
+    """Compute the digest of a run, 32 hexadecimal digits.
+
+    Args:
+        segment: Memory of the rack.
+        until: Tick at which the digest ends. None for the tick at which the run stopped.
     """
     stop = segment.words[System.STOP_TICK] if until is None else until
     total = blake2b(digest_size=16)

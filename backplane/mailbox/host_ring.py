@@ -1,9 +1,9 @@
-"""Mailboxes of the host side: a bounded ring from one host board to one bus adapter, not by ticks.
+"""Bounded ring mailboxes from one host board to one bus adapter, not by ticks.
 
-The host board writes at any time. A full ring is an answer, `False`, never a wait: nothing is
-overwritten that the adapter has not taken. The adapter takes messages in its own cycles, as many as
-it wants, and refuses those that are damaged, forged, or hold what no message of that type may hold.
-Its place in the ring is in shared memory, so an adapter that is restarted goes on there.
+The host board writes at any time. If the ring is full, a write returns False and never waits, and
+no message is overwritten that the adapter has not taken. The adapter takes any number of messages
+in its cycles and rejects messages that are damaged, forged, or contain values that their type does
+not permit. Its position in the ring is in shared memory, so a restarted adapter continues from it.
 
 Alternatives considered: a pipe or a socket per host board (the kernel copies each message twice,
 and a dead reader raises in the writer), and protocol time-slice (a host board has no ticks at which
@@ -25,15 +25,17 @@ from rack.backplane.words import Box
 
 
 class HostWriter(DoubleBufferWriter):
-    """The host board's end of a ring. Opening it claims the mailbox, as any writer does."""
+    """The host board's end of a ring. Opening it claims the mailbox, as for any writer."""
 
     def __init__(self, segment: Segment, name: str) -> None:
         super().__init__(segment, name)
         self._box = self.slots.box
 
     def send(self, tick: int) -> bool:
-        """Publish `message`, written at `tick`; return False, and count it, when the ring is
-        full.
+        """Publish `message`, written at `tick`.
+
+        Returns:
+            False if the ring is full. The message is then counted as refused.
         """
         if self._box[Box.HEAD] - self._box[Box.TAKEN] >= self.spec.capacity:
             self._box[Box.REFUSED] += 1
@@ -42,27 +44,25 @@ class HostWriter(DoubleBufferWriter):
 
 
 class HostReader:
-    """The adapter's end of a ring. `taken` and `refused` count messages taken from it, and those
-    that were bad.
-    """
+    """The adapter's end of a ring."""
 
     def __init__(self, segment: Segment, name: str) -> None:
         self.spec = spec = segment.layout.mailbox(name)
         self._slots = Slots(segment, spec)
         self._box = self._slots.box
         self.refused = 0
-        """Messages refused: damaged, forged, or improper."""
+        """Number of messages rejected because they were damaged, forged or improper."""
         self.superseded = 0
-        """Messages that a newer one overtook before it was taken."""
+        """Number of messages that were replaced by a newer one before they were taken."""
 
     @property
     def waiting(self) -> int:
-        """Messages that wait, at most the slots of the ring."""
+        """Number of waiting messages, at most the number of slots."""
         return min(max(0, self._box[Box.HEAD] - self._box[Box.TAKEN]), self.spec.depth)
 
     @property
     def full(self) -> int:
-        """How often the writer found the ring full."""
+        """Number of times the writer found the ring full."""
         return self._box[Box.REFUSED]
 
     @property
@@ -71,18 +71,26 @@ class HostReader:
         return self._slots.tick
 
     def take(self) -> AnyMessage | None:
-        """Take the oldest message that waits; None if it is bad. Valid until the next call."""
+        """Take the oldest waiting message. Returns None if it is bad.
+
+        The message is valid until the next call.
+        """
         head = self._box[Box.HEAD]
         oldest = self._box[Box.TAKEN] + 1
-        # Only a writer that does not keep to the rules overwrites what waits.
+        # Waiting messages are overwritten only by a writer that breaks the rules.
         serial = max(oldest, head - self.spec.depth + SPARE)
         self.superseded += serial - oldest
         self._box[Box.TAKEN] = serial
         return self._fetched(serial)
 
     def take_newest(self, most: int) -> AnyMessage | None:
-        """Take all that wait and return the newest good one, looking at no more than `most`; None:
-        there is none.
+        """Take all waiting messages, and return the newest good one.
+
+        Args:
+            most: Maximum number of messages to check.
+
+        Returns:
+            None if none of these is good.
         """
         waiting = self.waiting
         head = self._box[Box.HEAD]
@@ -94,6 +102,7 @@ class HostReader:
         return None
 
     def _fetched(self, serial: int) -> AnyMessage | None:
+        """Return the message of a serial. A bad one is counted as refused and gives None."""
         slots = self._slots
         if (
             slots.fetch(serial)
@@ -106,13 +115,15 @@ class HostReader:
 
 
 def is_proper(record: np.ndarray | np.void, fields: Sequence[FieldSpec]) -> bool:
-    """Say whether a message, or some groups of one, hold only what their types permit: finite
-    numbers, lengths, members of enums, ASCII.
+    """Check whether a message or groups of one contain only permitted values.
+
+    These are finite numbers, lengths within their limits, members of enums, and ASCII texts.
     """
     return all(_is_permitted(record[field.name], field) for field in fields)
 
 
 def _is_permitted(values: np.ndarray, field: FieldSpec) -> bool:
+    """Check the values of one field, which may have any shape."""
     kind = values.dtype.kind
     if kind == "f" and not np.isfinite(values).all():
         return False
@@ -122,11 +133,12 @@ def _is_permitted(values: np.ndarray, field: FieldSpec) -> bool:
         return False
     if field.length and not _has_length(values, field.length, bool(field.shape)):
         return False
-    # In an array of groups, those that are all zero are empty.
+    # In an array of groups, groups of zeros are empty.
     return not field.fields or is_proper(values[values != np.zeros_like(values)], field.fields)
 
 
 def _has_length(values: np.ndarray, limits: tuple[float, float], is_vector: bool) -> bool:
+    """Check the length of vectors along the last axis, or the magnitude of numbers."""
     sizes = np.abs(values)
     if is_vector:
         # Never overflows, unlike a sum of squares.

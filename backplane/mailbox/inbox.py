@@ -1,9 +1,8 @@
-"""The inbox of a board under protocol interrupt, as arithmetic: which messages are served, when,
-and which are lost.
+"""Timing of a board's inbox under protocol interrupt: messages served, and messages lost.
 
 An interrupt handler serves one message at a time, in the order of arrival. `depth` messages may
-wait; one that arrives when so many wait is lost. All times are ns. Nothing here knows of shared
-memory: boards, `rack check` and recordings use the same arithmetic.
+wait. A message that arrives when all places are taken is lost. All times are ns. This module does
+not use shared memory: boards, `rack check` and recordings use the same arithmetic.
 """
 
 from __future__ import annotations
@@ -16,21 +15,28 @@ from typing import NamedTuple
 
 
 class Inbox:
-    """A first-in-first-out server with `depth` places to wait. `lost` counts arrivals that found
-    all of them taken.
+    """First-in-first-out server with `depth` places to wait.
+
+    `lost` counts arrivals that found all places taken.
     """
 
     def __init__(self, depth: int) -> None:
         self.depth = depth
         self.lost = 0
         self.most_waiting = 0
-        """The largest number of messages that waited at the same time."""
+        """Largest number of messages that waited at the same time."""
         self._free_ns = 0
         self._starts: deque[int] = deque()
 
     def arrive(self, at_ns: int, service_ns: int) -> int | None:
-        """Return the end of the service of a message that arrives, not before the last one; None:
-        it is lost.
+        """Let a message arrive, not before the previous one.
+
+        Args:
+            at_ns: Time of arrival.
+            service_ns: Time for which the handler serves the message.
+
+        Returns:
+            The end of the service. None if the message is lost.
         """
         starts = self._starts
         while starts and starts[0] <= at_ns:
@@ -47,8 +53,10 @@ class Inbox:
 
 
 FULL_LOAD = 0.999
-"""Load of a handler from which its inbox counts as filling up: below 1 already, so that bursts stay
-short to follow."""
+"""Load of a handler from which its inbox counts as filling up.
+
+It is below 1, so that a simulated burst stays short.
+"""
 
 
 class InterruptSource(NamedTuple):
@@ -59,12 +67,15 @@ class InterruptSource(NamedTuple):
 
 
 class Burst(NamedTuple):
-    """The worst case of an inbox: every source sends at once, then in each of its periods, until
-    nothing waits.
+    """Worst case of an inbox: every source sends at once, then in each of its periods.
 
-    `waiting` is the most that wait, `longest_ns` the longest time from arrival to the end of
-    service, `load` the handler's part of the processor. From `FULL_LOAD` on the inbox fills up,
-    whatever its depth: both are then None.
+    It ends when no message waits. From a load of `FULL_LOAD` on, the inbox fills up whatever its
+    depth, and `waiting` and `longest_ns` are None.
+
+    Attributes:
+        load: Share of the processor that the handler uses.
+        waiting: Largest number of waiting messages.
+        longest_ns: Longest time from the arrival of a message to the end of its service.
     """
 
     load: float
@@ -72,13 +83,14 @@ class Burst(NamedTuple):
     longest_ns: int | None
 
     def fits(self, depth: int) -> bool:
-        """Say whether no message is ever lost if `depth` may wait."""
+        """Check whether an inbox with `depth` places never loses a message."""
         return self.waiting is not None and self.waiting <= depth
 
 
 def burst_of(sources: Sequence[InterruptSource]) -> Burst:
-    """Return the worst case of an inbox with these sources: the critical instant of a
-    first-in-first-out server.
+    """Compute the worst case of an inbox with these sources.
+
+    It is the critical instant of a first-in-first-out server.
     """
     load = sum(source.service_ns / source.every_ns for source in sources)
     if load >= FULL_LOAD:
@@ -87,8 +99,8 @@ def burst_of(sources: Sequence[InterruptSource]) -> Burst:
     free_ns = 0
     longest_ns = 0
     for at_ns, service_ns in merge(*(_arrivals(source) for source in sources)):
-        # The arrivals of one instant come together: the first period ends where the next one begins
-        # idle.
+        # Arrivals of one instant belong together. The first busy period ends when an arrival finds
+        # the handler idle.
         if at_ns and at_ns >= free_ns:
             break
         end_ns = inbox.arrive(at_ns, service_ns)
@@ -99,6 +111,7 @@ def burst_of(sources: Sequence[InterruptSource]) -> Burst:
 
 
 def _arrivals(source: InterruptSource) -> Iterator[tuple[int, int]]:
+    """Yield the arrivals of a source from time 0 on, each with its service time, in ns."""
     at_ns = 0
     while True:
         yield at_ns, source.service_ns

@@ -1,29 +1,29 @@
-"""Protocol interrupt: every message interrupts each board that reads it, and a handler there serves
-one at a time.
+"""Protocol interrupt: every message interrupts each board that reads it.
 
-A message is sent at a logical instant: the release of the cycle that writes it plus that cycle's
-budgeted processor time, one tick without a budget; a plan at the end of its time slice. At the
-reading board it joins the `Inbox`. A level sees it at its first release at or after the end of its
-service. When too many wait it is lost, at that board only.
+A handler at the reading board serves one message at a time. A message is sent at a logical instant:
+the release of the cycle that writes it plus that cycle's budgeted processor time, one tick without
+a budget; a plan at the end of its time slice. At the reading board it joins the `Inbox`. A level
+sees it at its first release at or after the end of its service. When too many messages wait, it is
+lost at that board only.
 
-Every reading task works its board's inbox out by itself, from the heads of the slots in shared
-memory: who sent what when. That is a function of ticks alone, so all tasks of a board agree, and
-runs repeat, as long as messages are there at their instant. So a message must be written before the
-first tick that is not before it, and lockstep waits for it. One that is late counts as a miss of
-its writer, and as sent in the tick in which it is written.
+Every reading task computes its board's inbox independently, from the send times in the heads of the
+slots in shared memory. The result depends on ticks alone, so all tasks of a board agree, and runs
+repeat, as long as messages are in memory at their instant. A message must therefore be written
+before the first tick at or after its instant, and lockstep waits for it. A late message counts as a
+miss of its writer, and as sent in the tick in which it is written.
 
-A reader that is restarted replays the messages that the slots still hold, two seconds at least, and
-continues as the one before it, if the inbox was empty at any time within them. A writer that is
-restarted continues as under time-slice.
+A restarted reader replays the messages that are still in the slots, two seconds at least, and
+continues as the one before it, if the inbox was empty at any time within them. A restarted writer
+continues as under time-slice.
 
-Between tasks in one slot a message passes no bus, so it interrupts nobody: it is read as under
+Between tasks in one slot a message crosses no bus, so it interrupts no board and is read as under
 time-slice.
 
 Alternatives considered: the wall-clock instant of the write (runs would differ even if no deadline
-is missed), the end of the writer's cycle (time-slice with the handler's time on top: the reason to
-interrupt, that a message need not wait for a cycle's end, would not show), a process per board that
-serves interrupts and keeps the inbox in shared memory (a context switch for each message, and one
-more process that may die).
+is missed), the end of the writer's cycle (time-slice with the handler's time on top, so the benefit
+of interrupts, that a message need not wait for a cycle's end, would not show), and a process per
+board that serves interrupts and keeps the inbox in shared memory (a context switch for each
+message, and one more process that may die).
 """
 
 from __future__ import annotations
@@ -47,15 +47,17 @@ def how_sent(spec: MailboxSpec) -> InterruptSpec:
 
 
 def sent_ns(spec: MailboxSpec, clock_ns: int) -> int:
-    """Return the time from the tick from which a message is visible, at the earliest, to the
-    instant at which it was sent; negative.
+    """Return the time from a message's earliest visibility tick to the instant of sending.
+
+    The time is negative.
     """
     return how_sent(spec).sent_ns - spec.delay * clock_ns
 
 
 class InterruptWriter(Writer):
-    """The one writer of a mailbox under protocol interrupt. Its messages must be written before
-    they are sent.
+    """Writer of a mailbox under protocol interrupt.
+
+    Its messages must be written before they are sent.
     """
 
     def __init__(self, segment: Segment, name: str) -> None:
@@ -63,24 +65,23 @@ class InterruptWriter(Writer):
         self._due = how_sent(self.spec).due
 
     def visible_at(self, tick: int, now: int | None) -> int:
-        """Return the earliest tick at which the message is visible; a late one is sent in the tick
-        that writes it.
+        """Return the earliest tick at which the message is visible.
+
+        A late message is sent in the tick that writes it.
         """
         released = tick if now is None else max(tick, now - self._due + 1)
         return released + self._delay
 
 
 class InterruptLine:
-    """One mailbox that interrupts a board, as that board sees it: the serials served, and the
-    number lost there.
-    """
+    """One mailbox that interrupts a board, as seen by that board."""
 
     def __init__(self, segment: Segment, spec: MailboxSpec) -> None:
         self.service_ns = how_sent(spec).service_ns
         self.lost = 0
-        """Messages lost here because too many waited."""
+        """Number of messages lost at this board because too many waited."""
         self.served: deque[int] = deque(maxlen=MAX_STEP_BACK)
-        """Serials served, the last few."""
+        """Serials of the last few messages served."""
         self._slots = slots = Slots(segment, spec)
         self._box = slots.box
         self._heads = slots.heads
@@ -92,14 +93,21 @@ class InterruptLine:
 
     @property
     def found(self) -> int:
-        """Serial of the newest message that a reader is to judge: served, lost on its way, or not
-        its writer's.
+        """Serial of the newest message that a reader must judge.
+
+        It was served, lost on its way, or not sent by the writer.
         """
         served = self.served
         return max(served[-1] if served else 0, self._missing, self._suspect)
 
     def collect(self, until_ns: int, number: int, arrivals: list[tuple[int, int, int]]) -> None:
-        """Append the messages sent up to an instant: when, `number`, and serial."""
+        """Append the messages sent up to an instant to `arrivals`.
+
+        Args:
+            until_ns: The instant.
+            number: Index of this line, stored with each arrival.
+            arrivals: List of (time of arrival, index of the line, serial).
+        """
         head = self._box[0]
         heads = self._heads
         mask = self._mask
@@ -112,7 +120,7 @@ class InterruptLine:
         while serial <= head:
             words = heads[serial & mask]
             if words[Slot.SERIAL] != serial:
-                # Its slot was never filled: it raises no interrupt.
+                # The slot was never filled, so the message raises no interrupt.
                 self._missing = serial
             elif words[Slot.EPOCH] != self._signature and not self._accepts(serial):
                 # The true message will replace it, under the same serial.
@@ -128,9 +136,7 @@ class InterruptLine:
         self._passed = serial - 1
 
     def _accepts(self, serial: int) -> bool:
-        """Say whether a message comes from the writer that holds the claim, or from an earlier
-        holder.
-        """
+        """Check whether a message comes from the holder of the claim, or an earlier holder."""
         slots = self._slots
         if not slots.copy(serial) or not slots.is_lawful(self._signature):
             return False
@@ -139,8 +145,11 @@ class InterruptLine:
 
 
 class BoardInbox:
-    """The inbox of the board in a slot, as one of its tasks works it out. `lines` are its mailboxes
-    by name.
+    """Inbox of the board in a slot, as computed by one of its tasks.
+
+    Attributes:
+        lines: Mailboxes that interrupt the board, by name.
+        inbox: Timing of the inbox.
     """
 
     def __init__(self, segment: Segment, slot: int) -> None:
@@ -148,18 +157,18 @@ class BoardInbox:
         self.lines = {box.name: InterruptLine(segment, box) for box in boxes}
         self.inbox = Inbox(min(how_sent(box).depth for box in boxes))
         self.count = 0
-        """Messages served."""
+        """Number of messages served."""
         self.service_ns = 0
-        """Time for which the handler has worked on them."""
+        """Total time for which the handler has served them."""
         self._lines = tuple(self.lines.values())
         self._clock_ns = segment.layout.clock_ns
         self._tick = -1
         self._newest_ns = 0
-        # Arrived and not yet served: the end of the service, line and serial.
-        self._ahead: deque[tuple[int, InterruptLine, int]] = deque()
+        # Messages that have arrived and are not yet served: end of the service, line and serial.
+        self._in_service: deque[tuple[int, InterruptLine, int]] = deque()
 
     def advance(self, tick: int) -> None:
-        """Let everything happen that happens up to the release at `tick`."""
+        """Process all arrivals and services up to the release at `tick`."""
         if tick <= self._tick:
             return
         self._tick = tick
@@ -171,32 +180,32 @@ class BoardInbox:
             arrivals.sort()
         for at_ns, number, serial in arrivals:
             self._arrive(at_ns, self._lines[number], serial)
-        ahead = self._ahead
-        while ahead and ahead[0][0] <= until_ns:
-            _, line, serial = ahead.popleft()
+        in_service = self._in_service
+        while in_service and in_service[0][0] <= until_ns:
+            _, line, serial = in_service.popleft()
             line.served.append(serial)
             self.count += 1
             self.service_ns += line.service_ns
 
     def _arrive(self, at_ns: int, line: InterruptLine, serial: int) -> None:
-        # A message that was not there at its instant cannot come before others that have been
-        # served.
+        # A late message cannot be inserted before messages that have already been served.
+        """Add the arrival of a message to the inbox, or count the message as lost."""
         self._newest_ns = max(self._newest_ns, at_ns)
         end_ns = self.inbox.arrive(self._newest_ns, line.service_ns)
         if end_ns is None:
             line.lost += 1
         else:
-            self._ahead.append((end_ns, line, serial))
+            self._in_service.append((end_ns, line, serial))
 
 
 def open_inbox(segment: Segment, task: str) -> BoardInbox | None:
-    """Return the inbox of a task's board; None if nothing interrupts it."""
+    """Open the inbox of a task's board. Returns None if nothing interrupts the board."""
     slot = segment.layout.task(task).slot
     return BoardInbox(segment, slot) if segment.layout.interrupting(slot) else None
 
 
 class InterruptReader(Reader):
-    """A reader of a mailbox whose messages interrupt its board."""
+    """Reader of a mailbox whose messages interrupt its board."""
 
     def __init__(self, segment: Segment, name: str, inbox: BoardInbox) -> None:
         super().__init__(segment, name)
@@ -207,15 +216,10 @@ class InterruptReader(Reader):
         """Return the newest message served by the release at `tick`, with its verdict."""
         self.accesses += 1
         self._inbox.advance(tick)
-        self.found = serial = self._line.found
-        if serial == self.serial:
-            return self._unchanged
-        return self._new if self._obtain(serial) else self._take_older(serial, tick)
+        return self._take(self._line.found, tick)
 
     def _step_back(self, serial: int, tick: int) -> Reading[AnyMessage]:
-        """Take the newest good message that was served before a lost, damaged or forged one, if it
-        is unread.
-        """
+        """Accept the newest unread good message that was served before a bad one."""
         for older in reversed(self._line.served):
             if self.serial < older < serial:
                 if self._obtain(older):

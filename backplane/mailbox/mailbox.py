@@ -1,14 +1,14 @@
 """Mailboxes under logical execution time: one writer, many readers.
 
 The writer fills `writer.message` and calls `write(tick)`. A reader calls `read(tick)` and gets a
-`Reading`: message and verdict. `tick` is the release tick of the calling cycle. A message written
-in the cycle released at tick T becomes visible at T + delay, the end of that cycle, however early
-it was written. Reads therefore depend on ticks alone.
+`Reading` with message and verdict. `tick` is the release tick of the calling cycle. A message
+written in the cycle released at tick T becomes visible at T + delay, the end of that cycle, however
+early it was written. Reads therefore depend on ticks alone.
 
 Alternatives considered: a sequence lock (a writer killed inside a write leaves its readers spinning
-for ever), a kernel lock (the paper's, 3 to 4 times the cost: protocol `lock`), the newest whole
-message (not a function of ticks alone: protocol `double-buffer`). For the memory order that readers
-rely on see `slots`.
+for ever), a kernel lock (the paper's, 3 to 4 times the cost: protocol `lock`), and the newest
+complete message (not a function of ticks alone: protocol `double-buffer`). For the memory order on
+which readers rely, see `slots`.
 """
 
 from __future__ import annotations
@@ -17,23 +17,24 @@ import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from struct import Struct
 from typing import Generic, NamedTuple, TypeVar
 from weakref import WeakSet
 
+from rack.backplane.address_map import SLOT_HEAD_SIZE
 from rack.backplane.byte_lock import ByteLock
 from rack.backplane.errors import MailboxError
 from rack.backplane.mailbox.slots import Slots, claim, epoch_of, pid_of
 from rack.backplane.message import AnyMessage, Message
 from rack.backplane.segment import Segment
-from rack.backplane.words import Box, Slot, Word
+from rack.backplane.words import Box, Word
 
-# Signature, basis, tick and visibility: see `words.Slot`.
-_HEAD = Struct("@8xq16xq8x2q").unpack_from
 NOT_YET = 1 << 62
-"""Tick of the newest message before there is one: its age is negative, so it is never too old."""
+"""Tick of the newest message before the first one has come.
+
+The resulting age is negative, so the message is never too old.
+"""
 MAX_STEP_BACK = 4
-"""Messages that a read tries before a bad one, so that its work stays bounded."""
+"""Maximum number of messages that a read tries before a bad one, to bound its work."""
 
 
 class Verdict(IntEnum):
@@ -49,10 +50,15 @@ M = TypeVar("M", bound=Message, covariant=True)
 
 
 class Reading(NamedTuple, Generic[M]):
-    """A message, all zero before the first one, and the verdict of the read.
+    """Message and verdict of a read.
 
-    `is_lost`: its writer is dead, hangs, or has been silent for too long for its period. `earlier`:
-    in a mailbox where every message counts, the unread ones before this one, oldest first.
+    Attributes:
+        message: The message. All bytes are zero before the first one.
+        verdict: Whether the message is new, old or missing.
+        is_lost: True if the writer is dead, hangs, or has been silent for too long for its
+            period.
+        earlier: Unread messages before this one, oldest first, in a mailbox where every message
+            counts.
     """
 
     message: M
@@ -62,20 +68,20 @@ class Reading(NamedTuple, Generic[M]):
 
     @property
     def is_new(self) -> bool:
-        """Whether this is the first cycle that reads the message."""
+        """True if this is the first cycle that reads the message."""
         return self.verdict is Verdict.NEW
 
     @property
     def is_there(self) -> bool:
-        """Whether any message has come yet."""
+        """True if any message has come yet."""
         return self.verdict is not Verdict.NONE
 
 
 class Writer:
-    """The one writer of a mailbox, under protocol time-slice.
+    """The only writer of a mailbox, under protocol time-slice.
 
-    Opening claims the mailbox: a second writer is refused with `MailboxError` while the process of
-    the first one lives. A new writer continues after the last whole message, in a new epoch.
+    Opening it claims the mailbox. A second writer is refused with `MailboxError` while the process
+    of the first one lives. A new writer continues after the last complete message, in a new epoch.
     """
 
     def __init__(self, segment: Segment, name: str) -> None:
@@ -86,14 +92,14 @@ class Writer:
         self.message = self.slots.message
         self.bus_errors = 0
         self.held_up = 0
-        """Accesses so far that timed out because a dead or stopped process held the lock."""
+        """Number of accesses that timed out because a dead or stopped process held the lock."""
         self.held = 0
-        """Messages that injected faults hold back."""
+        """Number of messages that injected faults hold back."""
         self.refused = 0
-        """Messages of a queue that this writer has refused because it was full."""
+        """Number of messages that this writer of a queue has refused because it was full."""
         self.intruder = 0
-        """Another process that has published since this writer's last message but one; 0: none."""
-        # In the segment, whatever the slots publish to.
+        """Process that has published since this writer's last message but one, 0 for none."""
+        # The claim is in the segment, even if the slots publish to another head.
         self._claimed = segment.box(name)
         self._claim = ByteLock(segment.fd, segment.map.mailboxes[name] + 8 * Box.CLAIM)
         self.claim()
@@ -102,37 +108,51 @@ class Writer:
         _WRITERS.add(self)
 
     def claim(self) -> None:
-        """Claim the mailbox, in a new epoch. Raises `MailboxError` when it has another writer."""
+        """Claim the mailbox in a new epoch.
+
+        Raises:
+            MailboxError: The mailbox has another writer.
+        """
         box = self._claimed
         if not self._claim.take():
             pid = box[Box.WRITER_PID]
             self._claim.close()
-            raise MailboxError(
-                f"mailbox '{self.spec.name}' has a writer already, process {pid}; permitted: one"
-            )
+            raise MailboxError(f"mailbox '{self.spec.name}' already has a writer (process {pid})")
         box[Box.WRITER_PID] = os.getpid()
         box[Box.EPOCH] = epoch = epoch_of(box[Box.EPOCH] + 1)
-        # One store: no reader sees half a claim.
+        # Epoch and process are stored at once, so that no reader sees half a claim.
         box[Box.CLAIMANT] = self.slots.signature = claim(epoch, os.getpid())
 
     def write(self, tick: int, now: int | None = None, basis: int | None = None) -> bool:
-        """Publish `message`, released at `tick`; return False when it is too late.
+        """Publish `message`.
 
-        It becomes visible at `tick` + delay. If the clock, `now`, has passed that tick, it becomes
-        visible at the next boundary of the writer's period.
+        It becomes visible at `tick` + delay. If the clock has passed that tick, it becomes visible
+        at the next boundary of the writer's period.
+
+        Args:
+            tick: Release tick of the cycle that writes.
+            now: Current tick. None if the end of the cycle has not come.
+            basis: Tick of the oldest information on which the message depends, by default
+                `tick`.
+
+        Returns:
+            False if the message is too late.
         """
         visible_at = self.visible_at(tick, now)
         is_whole = self.publish(tick, visible_at, tick if basis is None else basis)
         return is_whole and self.is_in_time(tick, now)
 
     def is_in_time(self, tick: int, now: int | None) -> bool:
-        """Say whether a message released at `tick` and written now comes in time; `now` as in
-        `write`.
-        """
+        """Check whether a message released at `tick` and written at `now` is in time."""
         return now is None or now < tick + self._due
 
     def visible_at(self, tick: int, now: int | None) -> int:
-        """Return the tick from which a message released at `tick` and written now is visible."""
+        """Return the tick from which a message is visible.
+
+        Args:
+            tick: Release tick of the cycle that writes.
+            now: Current tick. None if the end of the cycle has not come.
+        """
         in_time = tick + self._delay
         if now is None or now < in_time:
             return in_time
@@ -140,23 +160,30 @@ class Writer:
         return now + cycle - (now - self.spec.phase) % cycle
 
     def publish(self, tick: int, visible_at: int, basis: int, damage: Sequence[int] = ()) -> bool:
-        """Publish `message`, visible at that tick; return False when its bound cut it off.
+        """Publish `message`.
 
-        `damage`: see `Slots.publish`.
+        Args:
+            tick: Release tick of the cycle that writes.
+            visible_at: Tick from which the message is visible.
+            basis: Tick of the oldest information on which the message depends.
+            damage: Bits to flip, see `Slots.publish_message`.
+
+        Returns:
+            False if the access timed out.
         """
         self.intruder = self.slots.publish(tick, visible_at, basis, damage)
         return True
 
     def lose(self) -> None:
-        """Publish a serial without its message, as an injected loss does."""
+        """Publish a serial without its message, to inject a loss."""
         self.slots.lose()
 
     def outgoing(self) -> Iterator[None]:
-        """Put each message of the cycle into `message` in turn: here the one that is there."""
+        """Put each message of the cycle into `message` in turn. Only queues have several."""
         yield
 
     def show(self) -> None:
-        """Show what was published to readers: here they see it already."""
+        """Make published messages visible to readers. Under this protocol they already are."""
 
     @property
     def serial(self) -> int:
@@ -170,18 +197,18 @@ class Writer:
 
 
 _WRITERS: WeakSet[Writer] = WeakSet()
-"""The writers of this process that have their mailboxes claimed."""
+"""Writers of this process that have claimed their mailboxes."""
 
 
 def claim_again() -> None:
-    """Claim the mailboxes of this process in a segment that has taken the place of another."""
+    """Claim the mailboxes of this process in a segment that has replaced another."""
     for writer in _WRITERS:
         writer.claim()
 
 
 @dataclass(slots=True)
 class ReadStatistics:
-    """Counts of one reader's failed reads so far."""
+    """Counts of one reader's failed reads."""
 
     bad_reads: int = 0  # reads with any of the following
     bus_errors: int = 0  # accesses that their bound cut off
@@ -192,25 +219,20 @@ class ReadStatistics:
     lost: int = 0  # of a queue: serials without a message
 
 
-class ReaderState:
-    """Words of a reader's state: private memory, which compiled reads share with the reader."""
-
-    SERIAL = 0
-    FOUND = 1
-    NEWEST = 2
-    VISIBLE = 3
-    BASIS = 4
-    ACCESSES = 5
-    TRANSFERS = 6
-    SIGNATURE = 7  # of the writer of the last good message
-    JUDGED = 8  # of the reader's `MessageWatch`: serial of the newest message judged
-    JUDGED_TICK = 9  # and its release tick
-    COUNT = 10
+# A reader's state is private memory that the reader shares with compiled code. It consists of five
+# words and the last good message with its head: see `words.Slot`.
+JUDGED = 3
+"""Index in a reader's state of the newest serial that its `MessageWatch` has judged."""
+JUDGED_TICK = 4
+"""Index in a reader's state of that message's release tick."""
+GOOD = 40
+"""Offset of the last good message in a reader's state, in bytes."""
 
 
 class Reader:
-    """A reader of a mailbox, under protocol time-slice. The work of a read is bounded by the
-    mailbox's depth.
+    """Reader of a mailbox, under protocol time-slice.
+
+    The work of a read is bounded by the mailbox's depth.
 
     Attributes:
         serial: Serial of the last good message, 0 without one.
@@ -218,66 +240,67 @@ class Reader:
         newest: Release tick of the last good message.
         visible: Tick at which the last good message became visible.
         basis: Tick of the oldest information on which the last good message depends.
-        accesses: Reads so far.
-        transfers: Messages copied so far.
-        words: The state of the reader, with all of these: see `ReaderState`.
+        accesses: Number of reads.
+        transfers: Number of messages copied.
+        words: The words of the state, which contain all of these.
     """
 
-    serial = Word(ReaderState.SERIAL)
-    found = Word(ReaderState.FOUND)
-    newest = Word(ReaderState.NEWEST)
-    visible = Word(ReaderState.VISIBLE)
-    basis = Word(ReaderState.BASIS)
-    accesses = Word(ReaderState.ACCESSES)
-    transfers = Word(ReaderState.TRANSFERS)
-    _signature = Word(ReaderState.SIGNATURE)
+    found = Word(0)
+    accesses = Word(1)
+    transfers = Word(2)
+    _signature = Word(6)
+    basis = Word(9)
+    serial = Word(10)
+    newest = Word(11)
+    visible = Word(12)
 
     def __init__(self, segment: Segment, name: str) -> None:
         self.spec = segment.layout.mailbox(name)
         self.slots = slots = Slots(segment, self.spec)
-        self._box = slots.box
-        self._heads = slots.heads
-        self._mask = slots.mask
-        self._depth = slots.depth
-        # The last good message has its own buffer: a corrupt copy never reaches it.
-        good = Slots(segment, self.spec)
+        # The last good message has a separate buffer, which a corrupt copy never reaches.
+        state = memoryview(bytearray(GOOD + len(slots.record)))
+        good = Slots(segment, self.spec, state[GOOD:])
+        """Last good message, with the head of its slot."""
         self.good = good.record
         """The last good message, with the head of its slot."""
         self.message = good.message
         self._readings = {verdict: Reading(self.message, verdict) for verdict in Verdict}
         self._new = self._readings[Verdict.NEW]
         self._unchanged = self._readings[Verdict.NONE]
-        self.words = memoryview(bytearray(8 * ReaderState.COUNT)).cast("q")
+        self.words = state[: GOOD + SLOT_HEAD_SIZE].cast("q")
         self.newest = NOT_YET
         self.statistics = ReadStatistics()
 
     def reading(self, is_new: bool) -> Reading[AnyMessage]:
-        """Return the last good message with verdict NEW, or else OLD; NONE before the first
-        message.
+        """Return the last good message with verdict NEW or OLD.
+
+        The verdict is NONE if `is_new` is False and no message has come yet.
         """
         return self._new if is_new else self._unchanged
 
     def read(self, tick: int) -> Reading[AnyMessage]:
         """Return the newest message visible at `tick`, with its verdict."""
         self.accesses += 1
-        serial = self._box[0]
-        last = self.serial
-        if serial != last:
-            self.slots.fence()
-            # Older messages are overwritten: a serial beyond the slots fails when it is taken.
-            oldest = last if serial - last < self._depth else serial - self._depth
-            heads = self._heads
-            mask = self._mask
-            while serial > oldest and heads[serial & mask][Slot.VISIBLE_AT] > tick:
+        slots = self.slots
+        serial = slots.box[0]
+        if serial != self.serial:
+            slots.fence()
+            # Older messages are overwritten. A serial beyond the slots fails when it is fetched.
+            oldest = max(self.serial, serial - slots.depth)
+            while serial > oldest and slots.visible_at(serial) > tick:
                 serial -= 1
+        return self._take(serial, tick)
+
+    def _take(self, serial: int, tick: int) -> Reading[AnyMessage]:
+        """Accept the message found by a read, unless it is the last good one."""
         self.found = serial
-        if serial == last:
+        if serial == self.serial:
             return self._unchanged
         return self._new if self._obtain(serial) else self._take_older(serial, tick)
 
     def _take_older(self, serial: int, tick: int) -> Reading[AnyMessage]:
-        """Judge a bad message, and take the newest good one before it."""
-        # The reader came too late: the slot is being overwritten.
+        """Judge a bad message, and accept the newest good one before it."""
+        # The reader is too late, and the slot is being overwritten.
         if not self.slots.keeps(serial):
             return self._cut_off()
         self.statistics.bad_reads += 1
@@ -285,27 +308,20 @@ class Reader:
         return self._step_back(serial, tick)
 
     def _obtain(self, serial: int) -> bool:
-        """Keep a message as the last good one; False when it is not good."""
+        """Accept a message as the last good one. Returns False if it is not good."""
         self.transfers += 1
         slots = self.slots
         if not slots.fetch(serial):
             return False
-        signature, basis, tick, visible = _HEAD(slots.record)
-        if signature != self._signature:
+        if slots.signature != self._signature:
             if not slots.is_lawful(self._signature):
                 return False
-            self._signature = signature
             self._unchanged = self._readings[Verdict.OLD]
         self.good[:] = slots.record
-        words = self.words
-        words[ReaderState.SERIAL] = serial
-        words[ReaderState.NEWEST] = tick
-        words[ReaderState.VISIBLE] = visible
-        words[ReaderState.BASIS] = basis
         return True
 
     def _step_back(self, serial: int, tick: int) -> Reading[AnyMessage]:
-        """Take the newest good message before a lost, damaged or forged one, if it is unread."""
+        """Accept the newest unread good message before a lost, damaged or forged one."""
         slots = self.slots
         tries = MAX_STEP_BACK
         for older in range(serial - 1, max(self.serial, serial - slots.depth), -1):
@@ -319,61 +335,63 @@ class Reader:
         return self._unchanged
 
     def _blame(self, serial: int) -> None:
-        """Count the fault of the message fetched last. If its slot holds another message, it is
-        lost: not counted.
+        """Count the fault of the message fetched last.
+
+        A message whose slot contains another message is lost, which its watch counts.
         """
         slots = self.slots
         if not slots.keeps(serial):
             return
         if not slots.is_sound:
-            # Serial 0: an empty slot, as at the start.
+            # An empty slot, as at the start, has serial 0.
             self.statistics.corrupt += slots.serial != 0
         elif slots.serial == serial:
             self._count_forged()
 
     def _count_forged(self) -> None:
+        """Count the message fetched last as forged, and record the process that it names."""
         self.statistics.forged += 1
         self.statistics.forger = pid_of(self.slots.signature)
 
     def _cut_off(self) -> Reading[AnyMessage]:
+        """Count a read that timed out, and return the last good message with BUS_ERROR."""
         self.statistics.bus_errors += 1
         self.statistics.bad_reads += 1
         verdict = Verdict.BUS_ERROR if self.serial else Verdict.NONE
         return self._readings[verdict]
 
     def with_earlier(self, reading: Reading[AnyMessage], before: int) -> Reading[AnyMessage]:
-        """Return a reading with the good messages after serial `before` and before its own, as far
-        as the slots reach back.
+        """Add the good messages after serial `before` to a reading, oldest first.
+
+        Messages that are no longer in the slots are missing.
         """
         if self.serial <= before + 1:
             return reading
         return reading._replace(earlier=tuple(self.slots.between(before, self.serial)))
 
     def peek(self) -> Reading[AnyMessage]:
-        """Return the newest whole message at once, under any protocol: for the host side."""
-        self.found = head = self._box[0]
+        """Return the newest complete message at once, under any protocol, for the host side."""
+        head = self.slots.box[0]
         self.slots.fence()
-        if head == self.serial:
-            return self._unchanged
-        return self._new if self._obtain(head) else self._take_older(head, NOT_YET)
+        return self._take(head, NOT_YET)
 
 
 class DoubleBufferWriter(Writer):
-    """A writer under protocol double-buffer: its message is visible as soon as it is whole."""
+    """Writer under protocol double-buffer, whose message is visible once complete."""
 
     def visible_at(self, tick: int, now: int | None) -> int:
-        """Return the tick at which the message is written: it is visible at once."""
+        """Return the tick at which the message is written, since it is visible at once."""
         return tick if now is None else now
 
 
 class DoubleBufferReader(Reader):
-    """A reader under protocol double-buffer (section 3.3 of the paper): gets the newest whole
-    message.
+    """Reader under protocol double-buffer (section 3.3 of the paper).
 
-    It reacts faster than time-slice; in real time it no longer depends on ticks alone.
+    It gets the newest complete message, so it reacts faster than under time-slice. In real time its
+    result no longer depends on ticks alone.
     """
 
     def read(self, tick: int) -> Reading[AnyMessage]:
-        """Return the newest whole message, with its verdict."""
+        """Return the newest complete message, with its verdict."""
         self.accesses += 1
         return self.peek()

@@ -1,10 +1,9 @@
-"""The mailbox protocols by name, and protocol lock: the paper's `lock; read; unlock`, made safe
-against dead holders.
+"""The mailbox protocols by name, and protocol lock: the paper's `lock; read; unlock`.
 
-A semaphore whose holder was killed stays down for ever, and does not show who held it. So processes
-wait on the semaphore, within a bound, but the critical section belongs to the one that holds the
-kernel's lock on the mailbox, which ends with its process. An access cut off by its bound is a bus
-error: a verdict, never a hang.
+The lock is safe against dead holders. A semaphore whose holder was killed stays down for ever, and
+does not show its holder. So processes wait on the semaphore, within a bound, but the critical
+section belongs to the process that holds the kernel's lock on the mailbox, which ends with its
+process. An access that times out is a bus error: a verdict, never a hang.
 """
 
 from __future__ import annotations
@@ -30,14 +29,18 @@ from rack.backplane.semaphores import lock_semaphore
 from rack.backplane.words import Box
 
 LOCK_WAIT_S = 0.002
-"""Bound of one wait: an access takes a microsecond or two, a preempted holder some hundred."""
+"""Maximum time of one wait.
+
+An access takes a microsecond or two, an access by a preempted holder some hundred.
+"""
 
 
 class MailboxLock:
     """Mutual exclusion on one mailbox, with a bounded wait.
 
-    `held_up` counts the waits that timed out while a dead or stopped process held the lock: a
-    fault, unlike a holder that has been preempted.
+    Attributes:
+        held_up: Number of waits that timed out while a dead or stopped process held the lock.
+            This is a fault, unlike a holder that has been preempted.
     """
 
     def __init__(self, segment: Segment, name: str, wait_s: float = LOCK_WAIT_S) -> None:
@@ -48,40 +51,50 @@ class MailboxLock:
         self.held_up = 0
 
     def acquire(self) -> bool:
-        """Take the lock within its bound; False when a living holder keeps it."""
+        """Take the lock within its bound. Returns False if a living holder keeps it."""
         if not self._semaphore.acquire(self._wait_s):
             holder = self._box[Box.OWNER]
-            # It may have released the lock, and ended, since.
+            # The holder may have released the lock and ended since the wait.
             if holder and state_of(holder) in GONE + STOPPED and self._box[Box.OWNER] == holder:
                 self.held_up += 1
-        # After a timeout, the kernel's lock is free if the semaphore's holder is dead; one of
-        # several waiters gets it. After a successful wait it may be taken: such a waiter got in
-        # between the two steps and is the owner.
+        # After a timeout, the kernel's lock is free if the semaphore's holder is dead, and one of
+        # several waiters gets it. After a successful wait the kernel's lock may still be taken, if
+        # such a waiter has become the owner between the two steps.
         if not self._owner.take():
             return False
         self._box[Box.OWNER] = os.getpid()
         return True
 
     def release(self) -> None:
-        """Release the lock. Only its owner may."""
+        """Release the lock. Only its owner may call this."""
         self._box[Box.OWNER] = 0
         self._owner.release()
         self._semaphore.release()
 
     def close(self) -> None:
-        """Close the descriptor; this releases the lock."""
+        """Close the descriptor, which releases the lock."""
         self._owner.close()
 
 
 class LockWriter(DoubleBufferWriter):
-    """A writer that publishes inside the critical section."""
+    """Writer that publishes inside the critical section."""
 
     def __init__(self, segment: Segment, name: str) -> None:
         super().__init__(segment, name)
         self.lock = MailboxLock(segment, name)
 
     def publish(self, tick: int, visible_at: int, basis: int, damage: Sequence[int] = ()) -> bool:
-        """Publish `message`; return False when the lock's bound cut it off."""
+        """Publish `message` inside the critical section.
+
+        Args:
+            tick: Release tick of the cycle that writes.
+            visible_at: Tick from which the message is visible.
+            basis: Tick of the oldest information on which the message depends.
+            damage: Bits to flip, see `Slots.publish_message`.
+
+        Returns:
+            False if the wait for the lock timed out.
+        """
         obtained = self.lock.acquire()
         self.held_up = self.lock.held_up
         if not obtained:
@@ -93,20 +106,20 @@ class LockWriter(DoubleBufferWriter):
             self.lock.release()
 
     def close(self) -> None:
-        """Release the claim."""
+        """Release the lock and the claim."""
         self.lock.close()
         super().close()
 
 
 class LockReader(Reader):
-    """A reader that copies inside the critical section."""
+    """Reader that copies inside the critical section."""
 
     def __init__(self, segment: Segment, name: str) -> None:
         super().__init__(segment, name)
         self.lock = MailboxLock(segment, name)
 
     def read(self, tick: int) -> Reading[AnyMessage]:
-        """Return the newest message; BUS_ERROR with the last good one after a timeout."""
+        """Return the newest message, or the last good one with BUS_ERROR after a timeout."""
         statistics = self.statistics
         self.accesses += 1
         obtained = self.lock.acquire()
@@ -133,7 +146,7 @@ READERS: dict[Protocol, type[Reader]] = {
     "double-buffer": DoubleBufferReader,
     "lock": LockReader,
     "queue": QueueReader,
-    # Of a board that its messages do not interrupt: the writer's own, or the host side.
+    # This is for boards that the messages do not interrupt: the writer's board and the host side.
     "interrupt": Reader,
 }
 OBSERVERS: dict[Protocol, type[Reader]] = {**READERS, "lock": DoubleBufferReader, "queue": Reader}
@@ -141,8 +154,10 @@ OBSERVERS: dict[Protocol, type[Reader]] = {**READERS, "lock": DoubleBufferReader
 
 
 def open_writer(segment: Segment, name: str) -> Writer:
-    """Claim a mailbox for writing under its protocol. Raises `MailboxError` when it has a
-    writer.
+    """Claim a mailbox for writing under its protocol.
+
+    Raises:
+        MailboxError: The mailbox has another writer.
     """
     return WRITERS[segment.layout.mailbox(name).protocol](segment, name)
 
@@ -150,10 +165,13 @@ def open_writer(segment: Segment, name: str) -> Writer:
 def open_reader(
     segment: Segment, name: str, asynchronous: bool = False, inbox: BoardInbox | None = None
 ) -> Reader:
-    """Open a mailbox for reading under its protocol; `asynchronous`: each message as soon as it is
-    whole.
+    """Open a mailbox for reading under its protocol.
 
-    `inbox`: that of the reading board, if anything interrupts it.
+    Args:
+        segment: Memory of the rack.
+        name: Name of the mailbox.
+        asynchronous: True to read each message as soon as it is complete.
+        inbox: Inbox of the reading board. None if nothing interrupts it.
     """
     if inbox is not None and name in inbox.lines:
         return InterruptReader(segment, name, inbox)
@@ -164,7 +182,8 @@ def open_reader(
 
 
 def open_observer(segment: Segment, name: str) -> Reader:
-    """Open a mailbox for reading its newest message at no cost to others: for the clock and the
-    host side.
+    """Open a mailbox for reading its newest message, without any cost to other readers.
+
+    The clock and the host side use observers.
     """
     return OBSERVERS[segment.layout.mailbox(name).protocol](segment, name)

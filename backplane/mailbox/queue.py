@@ -1,27 +1,26 @@
-"""Mailboxes under protocol queue: first in first out, one reader, each message read once and in
-order.
+"""Mailboxes under protocol queue: first in first out, with one reader.
 
-The writer sends any number of messages in a cycle. They are published together at its end, by one
-store, and become visible as under time-slice: a writer killed before that has sent none of them.
-The reader takes those that are visible at its release tick, oldest first, as many as it has room
-for.
+Each message is read once and in order. The writer sends any number of messages in a cycle. They are
+published together at its end, by one store, and become visible as under time-slice. A writer killed
+before that has sent none of them. The reader takes the messages that are visible at its release
+tick, oldest first, as many as it has room for.
 
-A queue is bounded: its `capacity` is the largest number of unread messages. When it is full `send`
-returns False: the writer never waits, and no unread message is overwritten. What has been taken is
-a message too: in each of its cycles the reader writes its position into a mailbox of its own,
-`<queue>_taken`, under time-slice. So fullness depends on ticks alone: what the reader takes at tick
-T gives the writer room from T plus the reader's cycle on.
+A queue is bounded: its `capacity` is the largest number of unread messages. When it is full, `send`
+returns False. The writer never waits, and no unread message is overwritten. The number of messages
+taken is a message too: in each of its cycles the reader writes its position into a separate
+mailbox, `<queue>_taken`, under time-slice. So fullness depends on ticks alone: a message that the
+reader takes at tick T gives the writer room from T plus the reader's cycle on.
 
 The reader's position is in shared memory before its level processes, so a message is read at most
 once, whatever happens: a reader killed in a cycle has taken the messages of that cycle, and its
-successor continues after them. The other order would read them twice, and a message that makes its
-reader fail would make every successor fail too. A level that must know whether a message was acted
-on compares its id with the one that the reader's status echoes. A successor reads the position from
-a word in the queue's head, in which it is multiplied by 3: an AN code, since no multiple of 3 is
-one bit away from another. The mailbox alone would not do: if its newest message is damaged, the one
-before it holds an older position. If it is the word that is damaged, the mailbox is whole.
+successor continues after them. The opposite order would read them twice, and a message that makes
+its reader fail would make every successor fail too. A level that must know whether a message was
+acted on compares its id with the id that the reader's status echoes. A successor reads the position
+from a word in the queue's head, where it is multiplied by 3. This is an AN code: no multiple of 3
+is one bit away from another. The mailbox alone would not suffice: if its newest message is damaged,
+the previous one contains an older position. If the word is damaged, the mailbox is intact.
 
-A lost, damaged or forged message is counted, and the order goes on with the next one.
+A lost, damaged or forged message is counted, and the order continues with the next one.
 
 Alternative considered: a position word in the mailbox's head, without a mailbox. It is not a
 function of ticks, so whether a queue is full would depend on which process is faster.
@@ -41,7 +40,7 @@ from rack.backplane.words import Box, Slot
 
 
 class QueueTaken(Message, version=1):
-    """How far the reader of a queue has come, written by that reader."""
+    """Position of the reader of a queue, written by that reader."""
 
     taken: int = field(
         unit="1", doc="serial of the newest message that the reader of the queue has taken; 0: none"
@@ -61,13 +60,17 @@ def taken_name(queue: str) -> str:
 
 
 def is_position(spec: MailboxSpec) -> bool:
-    """Say whether a mailbox holds the position of a queue's reader: the board itself writes it."""
+    """Check whether a mailbox contains the position of a queue's reader.
+
+    The board writes such a mailbox, not the level.
+    """
     return spec.message == QueueTaken.message_type.name
 
 
 def queues_of(layout: Layout) -> list[MailboxSpec]:
-    """Return the queues between tasks; the rings of host boards are not by ticks, so they have no
-    position.
+    """Return the queues between tasks.
+
+    The rings of host boards are not by ticks, so they have no position and are not included.
     """
     names = {box.name for box in layout.mailboxes}
     return [
@@ -76,31 +79,33 @@ def queues_of(layout: Layout) -> list[MailboxSpec]:
 
 
 class QueueWriter(Writer):
-    """The one writer of a queue. A level fills `message` and calls `send`; the board calls
-    `write`, once a cycle.
+    """Writer of a queue. A level fills `message` and calls `send`.
 
-    `taken` is the reader's position as of the writer's release tick: the board keeps it up to date.
+    The board calls `write` once a cycle.
+
+    Attributes:
+        taken: Position of the reader as of the writer's release tick, updated by the board.
     """
 
     def __init__(self, segment: Segment, name: str) -> None:
         super().__init__(segment, name)
         slots = self.slots
-        # Messages are published to a copy of the mailbox's head, then shown together.
+        # Messages are published to a copy of the mailbox's head and then shown together.
         self._shared = slots.box
         slots.box = memoryview(bytearray(slots.box)).cast("q")
-        # A predecessor may have been killed just before this.
+        # A predecessor may have been killed just before it stored this word.
         self._shared[Box.SENT] = self.serial
         self.taken = 0
         self._pending: list[bytes] = []
         self._shown_at = 0
 
     def room(self) -> int:
-        """Return how many messages the queue still takes in this cycle."""
+        """Return the number of messages that can still be sent in this cycle."""
         unread = self.serial - self.taken + self.held + len(self._pending)
         return max(0, self.spec.capacity - unread)
 
     def send(self, basis: int | None = None) -> bool:
-        """Put a copy of the message into the queue; return False if it is full."""
+        """Put a copy of the message into the queue. Returns False if the queue is full."""
         if not self.room():
             self.refused += 1
             self._shared[Box.REFUSED] += 1
@@ -109,8 +114,16 @@ class QueueWriter(Writer):
         return True
 
     def write(self, tick: int, now: int | None = None, basis: int | None = None) -> bool:
-        """Publish the messages sent in the cycle released at `tick`; return False when it is too
-        late for them.
+        """Publish the messages sent in the cycle released at `tick`.
+
+        Args:
+            tick: Release tick of the cycle that writes.
+            now: Current tick. None if the end of the cycle has not come.
+            basis: Tick of the oldest information on which the messages depend, by default
+                `tick`.
+
+        Returns:
+            False if the messages are too late.
         """
         if not self._pending:
             return True
@@ -123,16 +136,12 @@ class QueueWriter(Writer):
         return self.is_in_time(tick, now)
 
     def visible_at(self, tick: int, now: int | None) -> int:
-        """Return the tick from which messages released at `tick` and written now are visible, lost
-        ones too.
-        """
+        """Return the tick from which messages, including lost ones, are visible."""
         self._shown_at = super().visible_at(tick, now)
         return self._shown_at
 
     def outgoing(self) -> Iterator[None]:
-        """Put each message of the cycle into `message` in turn; the level finds its own content
-        there again.
-        """
+        """Put each message of the cycle into `message` in turn, then restore its content."""
         slots = self.slots
         present = bytes(self.message.raw)
         if self._shared[Box.HEAD] != slots.box[Box.HEAD]:
@@ -145,39 +154,49 @@ class QueueWriter(Writer):
         self.message.raw[:] = present
 
     def publish(self, tick: int, visible_at: int, basis: int, damage: Sequence[int] = ()) -> bool:
-        """Publish `message`, to be shown by `show`. `damage`: see `Slots.publish`."""
+        """Publish `message`, without showing it to readers before `show_published` is called.
+
+        Args:
+            tick: Release tick of the cycle that writes.
+            visible_at: Tick from which the message is visible.
+            basis: Tick of the oldest information on which the message depends.
+            damage: Bits to flip, see `Slots.publish_message`.
+        """
         self.slots.publish(tick, visible_at, basis, damage)
         return True
 
     def lose(self) -> None:
-        """Publish a serial without its message, as an injected loss does: the reader finds the gap
-        at its tick.
+        """Publish a serial without its message, to inject a loss.
+
+        The reader finds the gap at the tick at which the message would be visible.
         """
         slots = self.slots
         slots.heads[(self.serial + 1) & slots.mask][Slot.VISIBLE_AT] = self._shown_at
         slots.lose()
 
     def show(self) -> None:
-        """Show everything published: by one store each, first to observers, then to the reader."""
+        """Make all published messages visible, by one store each to observers and the reader."""
         self._shared[Box.HEAD] = serial = self.serial
         self._shared[Box.SENT] = serial
 
 
 class QueueReader(Reader):
-    """The one reader of a queue: a second one is refused with `MailboxError`.
+    """The only reader of a queue. A second one is refused with `MailboxError`.
 
-    `taken` is its position, the serial of the newest message taken. A new reader continues after
-    its predecessor's.
+    A new reader continues after the position of its predecessor.
+
+    Attributes:
+        taken: Position of the reader, the serial of the newest message taken.
     """
 
     def __init__(self, segment: Segment, name: str) -> None:
         super().__init__(segment, name)
         self._position = Writer(segment, taken_name(name))
         written = Reader(segment, taken_name(name)).peek().message.taken
-        taken, rest = divmod(self._box[Box.POSITION], 3)
+        taken, rest = divmod(self.slots.box[Box.POSITION], 3)
         self.taken = written if rest else max(written, taken)
         self._farthest = self.spec.delay + self.spec.every
-        # The value of a reading without a new message, until there is one.
+        # Until a new message comes, readings contain the last message taken.
         if self.taken and self._obtain(self.taken):
             self.transfers = 0
 
@@ -186,29 +205,33 @@ class QueueReader(Reader):
         return self.take(tick, ALL)
 
     def take(self, tick: int, most: int, now: int | None = None) -> Reading[AnyMessage]:
-        """Take the messages visible at `tick`, oldest first, at most `most`, and publish the
-        position.
+        """Take the messages visible at `tick`, oldest first, and publish the position.
 
-        The newest taken is the value, the others are in `earlier`. `now`: the clock's tick, as in
-        `Writer.write`.
+        Args:
+            tick: Release tick of the reading cycle.
+            most: Maximum number of messages to take.
+            now: Current tick, as in `Writer.write`.
+
+        Returns:
+            The newest message taken, with the others in `earlier`.
         """
         self.accesses += 1
-        box = self._box
+        slots = self.slots
+        box = slots.box
         count = 0
         earlier = list[AnyMessage]()
         head = box[Box.HEAD]
-        last = min(box[Box.SENT], self.taken + self._depth)
-        self.slots.fence()
-        if head > last and self.slots.fetch(head) and not self.slots.is_lawful(self._signature):
-            # Count a message that is not the writer's, and that its next one will replace: it is
-            # not taken.
+        last = min(box[Box.SENT], self.taken + slots.depth)
+        slots.fence()
+        if head > last and slots.fetch(head) and not slots.is_lawful(self._signature):
+            # Count a forged message without taking it, since the writer's next message will replace
+            # it.
             self.statistics.bad_reads += 1
             self._count_forged()
         while count < most and self._sees(self.taken + 1, last, tick):
             before = copied(self.message) if count else None
             if not self._obtain(self.taken + 1):
                 # Count the fault of the message fetched last, which is not good.
-                slots = self.slots
                 statistics = self.statistics
                 statistics.bad_reads += 1
                 if slots.serial != self.taken + 1:
@@ -225,7 +248,7 @@ class QueueReader(Reader):
         newest = self.taken
         while self._sees(newest + 1, last, tick):
             newest += 1
-        self._box[Box.POSITION] = 3 * self.taken
+        box[Box.POSITION] = 3 * self.taken
         position = self._position
         _PUT_POSITION(position.message.raw, 0, self.taken, newest - self.taken)
         position.write(tick, now)
@@ -234,14 +257,15 @@ class QueueReader(Reader):
         return self._new._replace(earlier=tuple(earlier)) if earlier else self._new
 
     def _sees(self, serial: int, last: int, tick: int) -> bool:
-        """Say whether a message may be read, or is not there to wait for; no good one is visible
-        that far ahead.
+        """Check whether a serial can be taken or skipped now.
+
+        A message that is visible too far ahead cannot be good, so it is not waited for.
         """
         if serial > last:
             return False
-        ahead = self._heads[serial & self._mask][Slot.VISIBLE_AT] - tick
-        return ahead <= 0 or (ahead > self._farthest and not self.slots.fetch(serial))
+        ticks_ahead = self.slots.visible_at(serial) - tick
+        return ticks_ahead <= 0 or (ticks_ahead > self._farthest and not self.slots.fetch(serial))
 
     def close(self) -> None:
-        """Release the claim."""
+        """Release the claim of the reader's position."""
         self._position.close()

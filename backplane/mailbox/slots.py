@@ -1,28 +1,29 @@
-"""The slots of one mailbox: how whole messages get into shared memory and out again.
+"""Slots of one mailbox, through which complete messages get into shared memory and out again.
 
 A message is built in a local record, copied into the slot after the newest one, and published by
-one store of its serial in the mailbox's head. A writer killed at any instruction leaves every
-published message intact. A reader checks serial and checksum of its copy, so it never returns half
-a message.
+storing its serial in the mailbox's head. A writer killed at any instruction leaves every published
+message intact. A reader checks serial and checksum of its copy, so it never returns half a message.
 
-Memory order: the one writer fills a slot, then stores the head's serial with release; a reader
-loads the serial with acquire before it copies the slot, so it sees all of it. A copy may still be
-torn by a writer that laps the reader; the checksum detects that. It does not cover the signature,
-which is stored after the message and loaded before it, so that a forged message being overwritten
-never carries the signature of the true writer. Before a reader concludes from a head that a slot
-has not been reused (`keeps`), its copy is complete; in turn the writer fills no slot before the
-previous head is stored. Words are aligned to 8 bytes, so they are never torn.
+Memory order: the only writer fills a slot and then stores the head's serial with release. A reader
+loads the serial with acquire before it copies the slot, so it sees all of the slot. A copy may
+still be torn by a writer that laps the reader, which the checksum detects. The checksum does not
+cover the signature. The signature is stored after the message and loaded before it, so that a
+forged message that is being overwritten never carries the signature of the true writer. Before a
+reader concludes from a head that a slot has not been reused (`is_kept`), its copy is complete. In
+turn the writer fills no slot before the previous head is stored. Words are aligned to 8 bytes, so
+they are never torn.
 
-On x86-64 plain loads and stores of aligned words have this order, and Python's are such. Boards
-have it from machine code (`rack.boards.run.compiled_mailbox`), which also gives the rare paths in
-this folder a `fence`. tests/backplane/mailbox/model.py checks the protocol exhaustively.
+On x86-64 plain loads and stores of aligned words have this order, and Python uses such loads and
+stores. Boards get the order from machine code (`rack.boards.run.compiled_mailbox`), which also
+provides a `fence` for the rare paths in this folder. tests/backplane/mailbox/model.py checks the
+protocol exhaustively.
 
-The checksum is XXH3, 64 bits, seeded with the checksum of the message before. So one pass over a
-message tells a reader whether its copy is whole and undamaged; and the newest checksum stands for
-all that was ever written, so that one comparison shows whether two runs are equal
-(`history.digest`). Alternatives considered: CRC32 and a chained hash, two passes that took half of
-a write; CRC32 alone, seeded likewise: 32 bits are few for a digest, and on 200 bytes it takes five
-times as long.
+The checksum is XXH3 with 64 bits, seeded with the checksum of the previous message. One pass over a
+message tells a reader whether its copy is complete and undamaged. The newest checksum covers all
+that was ever written, so one comparison shows whether two runs are equal
+(`history.compute_digest`). Alternatives considered: CRC32 and a chained hash, two passes that took
+half of a write; and a seeded CRC32 alone, whose 32 bits are few for a digest and which takes five
+times as long on 200 bytes.
 """
 
 from __future__ import annotations
@@ -43,20 +44,20 @@ from rack.backplane.words import Box, Slot, Word
 
 CHECKED_FROM = Slot.BASIS * 8
 SIGNED_FROM = Slot.CHAIN * 8
-"""Offset of the message in a slot, after its time stamp and signature, bytes."""
-# Plain integers: an IntEnum member costs a conversion at every use as an index.
+"""Offset in a slot of the words after time stamp and signature, in bytes."""
+# Module constants are faster than class attributes.
 _STAMP, _EPOCH, _CHAIN, _CHECK, _BASIS, _SERIAL, _TICK, _VISIBLE = range(8)
 _PUT_CONTENT = Struct("@4Q").pack_into  # BASIS to VISIBLE_AT, each stored whole
-_CLAIMANT = int(Box.CLAIMANT)
 UNSIGNED = (1 << 64) - 1
-"""Mask that turns a word of a slot's head, which is signed, into a checksum."""
+"""Mask that turns a signed word of a slot's head into a checksum."""
 EPOCH_BITS = 32
 EPOCH_MASK = (1 << EPOCH_BITS) - 1
 
 
 def claim(epoch: int, pid: int) -> int:
-    """Return a writer's signature: the epoch of its claim and, in the upper half, its process
-    id.
+    """Build a writer's signature from the epoch of its claim and its process id.
+
+    The process id is in the upper half.
     """
     return epoch | pid << EPOCH_BITS
 
@@ -67,7 +68,7 @@ def epoch_of(signature: int) -> int:
 
 
 def pid_of(signature: int) -> int:
-    """Return the process in a writer's signature."""
+    """Return the process id in a writer's signature."""
     return signature >> EPOCH_BITS
 
 
@@ -84,24 +85,30 @@ def message_dtype(fields: tuple[FieldSpec, ...], size: int) -> np.dtype:
 
 
 def _format(field: FieldSpec) -> tuple[str | np.dtype, tuple[int, ...]]:
+    """Return the numpy type and the shape of one field."""
     if not field.fields:
         return field.kind, field.shape
-    # A group's own size stands in its kind, "V<bytes>".
+    # The kind of a group, "V<bytes>", contains its size.
     return message_dtype(field.fields, int(field.kind[1:])), field.shape
 
 
 class Slots:
-    """One process's access to the slots of a mailbox: a local `record` and its `message`.
+    """One process's access to the slots of a mailbox.
 
-    `record` holds the head's eight words (`words.Slot`), then the message; `words` and `covered`
-    are views of its head and of what the checksum covers. `places` are the slots, `heads` their
-    words.
+    Attributes:
+        record: Local copy of one slot: the eight words of its head (`words.Slot`) and the
+            message.
+        message: The message in the local record.
+        words: Head of the local record.
+        covered: Part of the local record that the checksum covers.
+        places: The slots in shared memory.
+        heads: Heads of the slots in shared memory.
     """
 
-    # Of the message in the local record: when it was published, CLOCK_MONOTONIC, and by which
-    # writer (see `claim`); the checksum over it and every earlier message of the mailbox; its
-    # serial, 0 without a message; the release of the cycle that wrote it, and the tick from which
-    # it may be read.
+    # Words of the local record: time of publication (CLOCK_MONOTONIC), signature of the writer
+    # (see `build_signature`), checksum over this and every earlier message of the mailbox, serial
+    # (0 without a message), release tick of the writing cycle, and tick from which the message is
+    # visible.
     stamp_ns = Word(Slot.STAMP_NS)
     signature = Word(Slot.EPOCH)
     chain = Word(Slot.CHECK)
@@ -109,7 +116,9 @@ class Slots:
     tick = Word(Slot.TICK)
     visible = Word(Slot.VISIBLE_AT)
 
-    def __init__(self, segment: Segment, spec: MailboxSpec) -> None:
+    def __init__(
+        self, segment: Segment, spec: MailboxSpec, record: memoryview | None = None
+    ) -> None:
         self.spec = spec
         dtype = message_dtype(spec.fields, spec.size)
         address = segment.map.mailboxes[spec.name]
@@ -117,11 +126,10 @@ class Slots:
         self.box = segment.box(spec.name)
         self.depth = spec.depth
         self.mask = spec.depth - 1
-        self.record = memoryview(bytearray(SLOT_HEAD_SIZE + spec.size))
+        self.record = record or memoryview(bytearray(SLOT_HEAD_SIZE + spec.size))
         kind: Any = segment.message_classes.get(spec.name, AnyMessage)
         self.message: AnyMessage = kind(dtype, self.record[SLOT_HEAD_SIZE:])
         first = address + MAILBOX_HEAD_SIZE
-        self.ring = segment.view(first, spec.depth * stride)
         self.places = [
             segment.view(first + i * stride, len(self.record)) for i in range(spec.depth)
         ]
@@ -131,27 +139,27 @@ class Slots:
 
     @staticmethod
     def fence() -> None:
-        """Keep accesses to memory before and after it apart: nothing on x86-64, where a board puts
-        an instruction in its place all the same.
+        """Separate memory accesses before this call from those after it.
+
+        Python needs no instruction for this on x86-64. Boards replace it with a compiled fence.
         """
 
     def resume(self, signature: int) -> None:
-        """Continue after the newest published message, as a writer."""
-        # Without the sign: a flipped one is no reason to fail.
-        head = whole = self.box[Box.HEAD] & (UNSIGNED >> 1)
-        # A serial may have been lost: the chain continues from the newest message that is in its
-        # slot.
-        while whole > max(0, head - self.depth) and not self.holds(whole):
-            whole -= 1
-        self.serial = head
+        """Prepare a writer to continue after the newest published message."""
+        # Ignore the sign, so that a flipped sign bit does not make a writer fail.
+        self.serial = head = self.box[Box.HEAD] & (UNSIGNED >> 1)
         self.signature = signature
-        self.chain = (
-            self.heads[whole & self.mask][_CHECK] & UNSIGNED if whole and self.holds(whole) else 0
-        )
+        # A serial may be lost. The chain continues from the newest message that is in its slot.
+        self.chain = 0
+        for serial in range(head, max(0, head - self.depth - 1), -1):
+            if self.holds(serial):
+                self.chain = self.heads[serial & self.mask][_CHECK] & UNSIGNED
+                break
 
     def clear_unpublished(self) -> None:
-        """Empty the slots that a dead writer has filled and not published: no reader may take
-        them for messages of this writer's that are lost.
+        """Empty the slots that a dead writer has filled but not published.
+
+        Otherwise readers could take them for lost messages of this writer.
         """
         head = self.box[Box.HEAD] & (UNSIGNED >> 1)
         for words in self.heads:
@@ -159,11 +167,19 @@ class Slots:
                 words[_SERIAL] = 0
 
     def publish(self, tick: int, visible_at: int, basis: int, damage: Sequence[int] = ()) -> int:
-        """Copy the local message into the next slot, then publish it; return the process of an
-        intruder, 0: none.
+        """Copy the local message into the next slot and publish it.
 
-        An intruder has published since this writer's last message; its message is overwritten.
-        `damage`: bits of the message to flip in the slot.
+        An intruder is a process that has published since this writer's last message. Its message is
+        overwritten.
+
+        Args:
+            tick: Release tick of the cycle that writes.
+            visible_at: Tick from which the message is visible.
+            basis: Tick of the oldest information on which the message depends.
+            damage: Bits of the message to flip in the slot, to inject a fault.
+
+        Returns:
+            Process id of an intruder, 0 for none.
         """
         words = self.words
         box = self.box
@@ -175,7 +191,7 @@ class Slots:
         words[_CHAIN] = chain = words[_CHECK]
         words[_CHECK] = xxh3(self.covered, chain)
         words[_STAMP] = monotonic_ns()
-        # In this order: the previous head, the message, its signature, this head.
+        # The order of stores is: the previous head, the message, its signature, this head.
         self.fence()
         self.places[at][SIGNED_FROM:] = self.record[SIGNED_FROM:]
         if damage:
@@ -195,58 +211,62 @@ class Slots:
         self.box[0] = self.serial
 
     def holds(self, serial: int) -> bool:
-        """Say whether that serial's slot holds its message, not an older or a newer one."""
+        """Check whether the slot of a serial contains its message, not an older or newer one."""
         return self.heads[serial & self.mask][_SERIAL] == serial
 
     def keeps(self, serial: int) -> bool:
-        """Say whether that serial's slot has not been reused: a copy made before this call is then
-        of that message.
+        """Check whether the slot of a serial has not been reused.
+
+        If so, a copy made before this call is a copy of that message.
         """
         self.fence()
         return serial >= oldest_kept(self.box[0], self.depth)
 
     def visible_at(self, serial: int) -> int:
-        """Return the tick from which the message in that serial's slot may be read."""
+        """Return the tick from which the message in the slot of a serial is visible."""
         return self.heads[serial & self.mask][_VISIBLE]
 
     def load(self, serial: int) -> None:
-        """Copy that serial's slot, without any check, into the local record."""
+        """Copy the slot of a serial into the local record, without any check."""
         place = self.places[serial & self.mask]
-        # If this is the signature of the message sought, all of that is in the slot.
+        # If this is the signature of the wanted message, the slot contains all of the message.
         self.record[:SIGNED_FROM] = place[:SIGNED_FROM]
         self.fence()
         self.record[SIGNED_FROM:] = place[SIGNED_FROM:]
 
     def fetch(self, serial: int) -> bool:
-        """Copy a message into the local record; False when it is not whole, or another one."""
+        """Copy a message into the local record. Returns False if it is torn or another message."""
         self.load(serial)
-        words = self.words
-        return words[_SERIAL] == serial and words[_CHECK] == xxh3(self.covered, words[_CHAIN])
+        return self.serial == serial and self.is_sound
 
     def between(self, before: int, newest: int) -> Iterator[AnyMessage]:
-        """Yield a copy of each good message between two serials, as far as the slots reach back."""
+        """Yield a copy of each good message between two serials that is still in its slot."""
         for serial in range(max(before + 1, newest - self.mask), newest):
             if self.fetch(serial) and self.is_lawful(0):
                 yield copied(self.message)
 
     def copy(self, serial: int) -> bool:
-        """Copy that serial's slot as `load` does; False when it was reused meanwhile."""
+        """Copy the slot of a serial as `load_slot` does.
+
+        Returns:
+            False if the slot was reused during the copy.
+        """
         self.load(serial)
         return self.keeps(serial)
 
     @property
     def is_sound(self) -> bool:
-        """Whether the message in the local record passes its check."""
+        """True if the message in the local record passes its check."""
         return self.chain == xxh3(self.covered, self.words[_CHAIN])
 
     def is_lawful(self, known: int) -> bool:
-        """Say whether that message comes from the writer that holds the claim, or from an earlier
-        holder.
+        """Check whether the local message comes from the holder of the claim, or an earlier holder.
 
-        `known` is the signature of the last lawful message, 0 before the first: epochs only rise.
+        Args:
+            known: Signature of the last lawful message, 0 before the first. Epochs only rise.
         """
         signature = self.signature
-        holder = self.box[_CLAIMANT]
+        holder = self.box[Box.CLAIMANT]
         return signature in (known, holder) or epoch_of(known) < epoch_of(signature) < epoch_of(
             holder
         )

@@ -1,1 +1,1 @@
-"""Alarms, and what raises them about tasks and messages."""
+"""Detection of message faults and lost writers by the tasks that read their mailboxes."""

@@ -1,7 +1,7 @@
-"""Alarm rings: a task or the clock reports the faults that it has found. One fixed record per
-alarm, never a wait.
+"""Alarm rings, in which a task or the clock reports the faults that it has detected.
 
-An alarm is raised once per episode: when a condition is found, not in every cycle while it lasts.
+One fixed record per alarm is written, without ever waiting. An alarm is raised once per episode,
+when a condition is found, not in every cycle while it lasts.
 """
 
 from __future__ import annotations
@@ -21,27 +21,30 @@ RECORD = np.dtype(
         ("tick", "i8"),  # release, in ticks, of the cycle that found it; for the clock, its tick
         ("time_ns", "i8"),  # CLOCK_MONOTONIC
         ("code", "i8"),  # Alarm
-        ("subject", "i8"),  # see Alarm; -1: none
+        ("subject", "i8"),  # see Alarm, -1 for none
         ("value", "f8"),  # the measured value, see Alarm
         ("since", "i8"),  # tick since which the condition holds; `tick` if not known
-        ("text", "S144"),  # UTF-8: what a level says of its own finding
+        ("text", "S144"),  # UTF-8: a level's description of its finding
     ]
 )
 
 
 PEER = -2
-"""Subject of a demand on the arm that the loss of another rack makes."""
+"""Subject of a demand on the arm that is caused by the loss of another rack."""
 
 
 BY_DEMAND = -1
 NO_TORQUE = -2
 AT_START = -3
-"""Why brakes engaged, where no error says it: on a demand, because no torque came in time, or had
-come at all."""
+"""Reasons for engaged brakes that no error describes.
+
+The brakes engaged on a demand (`BRAKED_BY_DEMAND`), because no torque came in time
+(`BRAKED_WITHOUT_TORQUE`), or because no torque had come yet (`BRAKED_AT_START`).
+"""
 
 
 class Alarm(IntEnum):
-    """Kinds of alarms. In brackets: subject; value."""
+    """Kinds of alarms. Comments give the meaning of [subject; value]."""
 
     # Raised by the clock: faults, losses and demands.
     FAULT_BEGINS = 1  # [entry of the fault table; -]
@@ -76,7 +79,8 @@ class Alarm(IntEnum):
     # Raised by tasks: the clock.
     CLOCK_STOPPED = 30  # [process id of that clock; ticks]
     CLOCK_SKIPPED = 31  # [-1; ticks skipped]
-    # [-1; lateness, ns] by the clock too: it woke so much later than the grid point of tick `since`
+    # [-1; lateness, ns] raised by the clock too. It woke this much after the grid point of tick
+    # `since`.
     CLOCK_LATE = 32
     # Raised by boards: what interrupts them.
     # [mailbox; messages lost in the cycle]  too many waited for the interrupt handler
@@ -89,7 +93,7 @@ class Alarm(IntEnum):
     ACTUATOR = 44  # [joint; residual]  the arm does not follow its torques
     COMMAND_INVALID = 45  # [joint; -]  rejected: a torque is NaN or infinite
     COMMAND_LIMIT = 46  # [joint; N m]  a torque beyond its limit was cut
-    # [error of the level, 0: the boards above, or `BY_DEMAND` ...; ticks without]
+    # [error of the level, 0: the boards above, or `BRAKED_BY_DEMAND` ...; ticks without]
     BRAKES_CLOSED = 47
     BRAKES_OPENED = 48  # [as they engaged; ticks they were engaged]
     RE_REFERENCED = 49  # [joint; distance from its estimate, rad]  its sensor is trusted again
@@ -119,13 +123,19 @@ class Alarm(IntEnum):
 
 
 MISSES = (Alarm.LATE, Alarm.PLAN_LATE, Alarm.STARVED, Alarm.CLOCK_SKIPPED, Alarm.CLOCK_LATE)
-"""Alarms of missed cycles: counted, but no action follows. All others are faults or reactions."""
+"""Alarms of missed cycles, which are counted without further action.
+
+All others are faults or reactions.
+"""
 
 
 class AlarmWriter:
-    """The writing end of an alarm ring: a task's, or the clock's ("clock").
+    """Writing end of the alarm ring of a task, or of the clock ("clock").
 
-    `attention` is an eventfd that wakes the Rack; None: no process is woken.
+    Args:
+        segment: Memory of the rack.
+        task: Name of the task.
+        attention: eventfd that wakes the Rack. None to wake no process.
     """
 
     def __init__(self, segment: Segment, task: str, attention: int | None = None) -> None:
@@ -146,16 +156,25 @@ class AlarmWriter:
         since: int | None = None,
         text: str = "",
     ) -> None:
-        """Append an alarm, and wake the Rack unless it is one of `MISSES`."""
+        """Append an alarm, and wake the Rack unless the alarm is one of `MISSES`.
+
+        Args:
+            tick: Release tick of the cycle that found the condition.
+            code: Kind of alarm.
+            subject: Subject as described at `Alarm`, -1 for none.
+            value: Measured value as described at `Alarm`.
+            since: Tick since which the condition holds. None if it is not known.
+            text: Text of a level about its finding.
+        """
         count = self._head[0] + 1
-        found = tick if since is None else since
+        since_tick = tick if since is None else since
         self._slots[count % ALARM_DEPTH] = (
             tick,
             monotonic_ns(),
             code,
             subject,
             value,
-            found,
+            since_tick,
             text.encode("utf-8", "replace"),
         )
         self._head[0] = count
@@ -165,7 +184,7 @@ class AlarmWriter:
 
 
 def alarm_ring(segment: Segment, task: str) -> Ring:
-    """Return the reading end of an alarm ring; its rows are of dtype `RECORD`."""
+    """Open the reading end of an alarm ring. Its rows have dtype `RECORD`."""
     address = segment.map.alarms[task]
     head = segment.words[address // 8 : address // 8 + 1]
     memory = segment.view(address + LINE, ALARM_DEPTH * ALARM_RECORD_SIZE)
@@ -173,14 +192,13 @@ def alarm_ring(segment: Segment, task: str) -> Ring:
 
 
 CLEAN_READS = 20
-"""Accesses, and cycles of the writer, without a finding after which the next one begins a new
-episode."""
+"""Number of accesses, and of the writer's cycles, without a finding that end an episode."""
 
 
 class Episodes:
     """Alarms about one mailbox, raised once per episode, however long a fault lasts.
 
-    Keeps each finding with the access and the tick at which it was last made.
+    Each finding is stored with the access and the tick at which it was last made.
     """
 
     def __init__(self, segment: Segment, name: str, alarms: AlarmWriter) -> None:
@@ -192,19 +210,25 @@ class Episodes:
     def find(
         self, code: Alarm, access: int, tick: int, value: float = 0.0, since: int | None = None
     ) -> None:
-        """Note a finding in an access, counted by the caller; raise the alarm if it begins an
-        episode.
+        """Record a finding, and raise its alarm if it begins an episode.
+
+        Args:
+            code: Kind of alarm.
+            access: Number of the access, counted by the caller.
+            tick: Release tick of the cycle.
+            value: Measured value.
+            since: Tick since which the condition holds. None if it is not known.
         """
         if not self.is_open(code, access, tick):
             self.ring(code, tick, value, since)
         self._last[code] = access, tick
 
     def ring(self, code: Alarm, tick: int, value: float = 0.0, since: int | None = None) -> None:
-        """Raise the alarm at once, when the caller knows that an episode begins."""
+        """Raise an alarm at once, if the caller knows that an episode begins."""
         self._alarms.ring(tick, code, self._subject, value, since)
 
     def is_open(self, code: Alarm, access: int, tick: int) -> bool:
-        """Say whether an episode still lasts."""
+        """Check whether an episode is still open."""
         if code not in self._last:
             return False
         last_access, last_tick = self._last[code]

@@ -1,10 +1,10 @@
-"""Checks on the messages of a mailbox: each one that has become visible since the last read, in
-serial order.
+"""Checks on the messages of a mailbox that have become visible since the last read.
 
-A fault is reported only on evidence that a slow machine cannot produce: a serial whose slot was
-never filled, a later serial with an earlier tick, two messages for one release, a message stamped
-after the end of the cycle that made it. The reader may be delayed too. So a message is copied
-first, then its slot must still be its own (`Slots.keeps`), and only then is the copy judged.
+Messages are judged in serial order. A fault is reported only on evidence that a slow machine cannot
+produce: a serial whose slot was never filled, a later serial with an earlier tick, two messages for
+one release, or a message stamped after the end of the cycle that made it. The reader may be delayed
+too. Therefore a message is copied first, its slot is checked for reuse (`Slots.is_kept`), and only
+then is the copy judged.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from __future__ import annotations
 from xxhash import xxh3_64_intdigest as xxh3
 
 from rack.backplane.address_map import oldest_kept
-from rack.backplane.mailbox.mailbox import Reader, ReaderState
+from rack.backplane.mailbox.mailbox import JUDGED, JUDGED_TICK, Reader
 from rack.backplane.mailbox.queue import QueueReader
 from rack.backplane.mailbox.slots import CHECKED_FROM, UNSIGNED
 from rack.backplane.segment import Segment
@@ -21,19 +21,20 @@ from rack.backplane.watch.alarms import Alarm, Episodes
 from rack.backplane.words import Slot, Word
 
 LONG_AGO = -(1 << 62)
-"""Tick of the message before the first."""
+"""Release tick assumed for the message before the first one."""
 
 
 class MessageWatch:
-    """Judges the messages of one mailbox for one reader; those before its first read are not
-    judged.
+    """Judges the messages of one mailbox for one reader, from its first read on.
 
-    `seen` is the serial of the newest message judged, -1 before the first read; `newest` is its
-    release tick. Both are words of the reader's state.
+    Attributes:
+        seen: Serial of the newest message judged, -1 before the first read.
+        newest: Release tick of that message. Both are words of the reader's state.
+        late_from: Delay from release to visibility from which a message is late, in ticks.
     """
 
-    seen = Word(ReaderState.JUDGED)
-    newest = Word(ReaderState.JUDGED_TICK)
+    seen = Word(JUDGED)
+    newest = Word(JUDGED_TICK)
 
     def __init__(self, segment: Segment, reader: Reader, episodes: Episodes) -> None:
         self._reader = reader
@@ -45,61 +46,62 @@ class MessageWatch:
         self._cycles = CycleRecord(segment, reader.spec.writer)
         self.newest = LONG_AGO
         self._is_sliced = reader.spec.is_by_ticks
-        # From this delay on a message is late. A message visible at once carries the tick at which
-        # it was written.
+        # A message that is visible at once carries the tick at which it was written.
         self.late_from = self._spec.delay + self._is_sliced
         self._held_up = 0
 
     def judge(self, tick: int) -> None:
         """Judge the messages found by the read at `tick`."""
-        found = self._reader.found
+        newest_serial = self._reader.found
         if self.seen < 0:
-            self._begin(found)
-        elif found > self.seen:
-            if found - self.seen > 1 and self._is_babble(found, tick):
-                self._begin(found)
+            self._begin(newest_serial)
+        elif newest_serial > self.seen:
+            if newest_serial - self.seen > 1 and self._is_babble(newest_serial, tick):
+                self._begin(newest_serial)
             else:
-                self._walk(found, tick)
+                self._walk(newest_serial, tick)
         if self._reader.statistics.held_up != self._held_up:
             self._held_up = self._reader.statistics.held_up
             self._find(Alarm.LOCKED, tick)
 
     def _begin(self, serial: int) -> None:
-        """Judge messages after a serial, and none before it."""
+        """Start judging after a serial. Earlier messages are not judged."""
         self.seen = serial
         if serial and self._copies(serial):
             self.newest = self._slots.tick
 
     def _copies(self, serial: int) -> bool:
-        """Copy a message into the local record; False when it is missing or cannot be trusted."""
+        """Copy a message into the local record. Returns False if it is missing or not trusted."""
         return self._slots.fetch(serial) and self._slots.keeps(serial)
 
-    def _is_babble(self, found: int, tick: int) -> bool:
-        """Say whether there are more messages than releases, by more than one."""
+    def _is_babble(self, newest_serial: int, tick: int) -> bool:
+        """Check whether there are at least two messages more than releases."""
         slots = self._slots
-        if not slots.keeps(found):
-            # Already overwritten: a writer of one message per cycle is not that fast.
-            found = slots.box[0]
-        if not self._copies(found):
+        if not slots.keeps(newest_serial):
+            # The message is already overwritten. A writer of one message per cycle is slower.
+            newest_serial = slots.box[0]
+        if not self._copies(newest_serial):
             return False
-        count = found - self.seen
+        count = newest_serial - self.seen
         cycles = (slots.tick - self.newest) // self._spec.every
         if count <= cycles + 1:
             return False
         self._find(Alarm.BABBLE, tick, count / max(1, cycles))
         return True
 
-    def _walk(self, found: int, tick: int) -> None:
-        """Judge the messages one by one, up to the newest found."""
+    def _walk(self, newest_serial: int, tick: int) -> None:
+        """Judge the messages one by one, up to the newest one found."""
         slots = self._slots
         mask = slots.mask
         taken = self._reader.serial
         late = self.late_from
         # A late reader cannot judge messages that are overwritten.
-        for serial in range(max(self.seen + 1, oldest_kept(slots.box[0], slots.depth)), found + 1):
+        for serial in range(
+            max(self.seen + 1, oldest_kept(slots.box[0], slots.depth)), newest_serial + 1
+        ):
             head = slots.heads[serial & mask]
             released = head[Slot.TICK]
-            # The reader has checked the message that it took, and only that one.
+            # The reader has checked only the message that it took.
             if (
                 head[Slot.SERIAL] == serial
                 and self.newest < released > head[Slot.VISIBLE_AT] - late
@@ -116,24 +118,24 @@ class MessageWatch:
             self.seen = serial
 
     def _judge_odd(self, serial: int, tick: int) -> bool:
-        """Judge an unusual message; False when it is too early to judge."""
+        """Judge an unusual message. Returns False if it is too early to judge."""
         slots = self._slots
-        # A second look if it is not whole: the true message may just be overwriting a forged one.
+        # Copy a torn message twice, because the true message may be overwriting a forged one.
         if not slots.copy(serial) or not (slots.is_sound or slots.copy(serial)):
             return True
         expected = self.newest + self._spec.every
         if slots.serial == serial and slots.is_sound:
             self._judge_time(slots.tick, slots.visible, tick)
         elif slots.serial == 0 or slots.is_sound:
-            # Its slot is empty, or holds another whole message: it is lost. It is not missing
-            # before the first tick at which it would have been visible.
+            # The slot is empty or contains another complete message, so this message is lost. It
+            # is not missing before the first tick at which it would have been visible.
             if self._is_sliced and expected + self._spec.delay > tick:
                 return False
             self.newest = expected
             self._find(Alarm.GAP, tick, 1)
         else:
             if slots.serial == serial:
-                # Its release tick may be damaged too; no release is later than now.
+                # The release tick may be damaged too, but no release is later than now.
                 self.newest = max(self.newest, min(slots.tick, tick))
             self._find(Alarm.DAMAGED, tick)
         return True
@@ -143,7 +145,7 @@ class MessageWatch:
         if released < self.newest:
             self._find(Alarm.DISORDER, tick, self.newest - released, since=released)
         elif visible - released >= self.late_from:
-            # Held back, not just finished late, if its cycle had ended before it was published.
+            # A message published after the end of its cycle was held back, not just finished late.
             ended_ns = self._cycles.ended_ns(released)
             if ended_ns is not None and self._slots.stamp_ns > ended_ns:
                 self._find(
@@ -152,12 +154,14 @@ class MessageWatch:
         self.newest = max(released, self.newest)
 
     def _find(self, code: Alarm, tick: int, value: float = 0.0, since: int | None = None) -> None:
+        """Record a finding of the current read."""
         self._episodes.find(code, self._reader.accesses, tick, value, since)
 
 
 class QueueWatch(MessageWatch):
-    """Judges the messages that the reader of a queue has taken, several of one release among
-    them.
+    """Judges the messages that the reader of a queue has taken.
+
+    A queue may contain several messages of one release.
     """
 
     def __init__(self, segment: Segment, reader: QueueReader, episodes: Episodes) -> None:
@@ -171,7 +175,7 @@ class QueueWatch(MessageWatch):
         queue = self._queue
         slots = self._slots
         for serial in range(self.seen + 1, queue.taken + 1):
-            # Its slot is the writer's again only when the writer learns that it has been taken.
+            # The writer reuses the slot only after it has learned that the message was taken.
             head = slots.heads[serial & slots.mask]
             if head[Slot.SERIAL] != serial:
                 continue

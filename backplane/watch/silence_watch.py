@@ -1,10 +1,10 @@
-"""Checks on a silent mailbox: its writer is lost, mute, or only late.
+"""Checks on a silent mailbox, whose writer is lost, mute or only late.
 
-Executors write in every cycle, so the age of their messages has a limit; plans have none. Silence
+Executors write in every cycle, so the age of their messages has a limit. Plans have none. Silence
 alone is a reason to hold (`is_lost`) but does not prove a fault. For an alarm the writer must be
-dead or stopped, or must have finished cycles for which no message came. A mailbox that is written
-only when there is something new has a limit of its own, for the age of its information; its writer
-reports why nothing comes, and may void what it wrote, or keep it.
+dead or stopped, or must have finished cycles without a message. A mailbox that is written on demand
+has a limit for the age of its information. Its writer reports why no message comes, and can declare
+the mailbox void or keep it valid.
 """
 
 from __future__ import annotations
@@ -21,16 +21,20 @@ from rack.backplane.watch.message_watch import LONG_AGO, MessageWatch
 from rack.backplane.words import Block, Box, is_on
 
 MUTE_CYCLES = 3
-"""Age in cycles of the writer from which silence is investigated; two are normal."""
+"""Age, in cycles of the writer, from which silence is investigated. An age of two is normal."""
 STALE_CYCLES = 4
 
 
 class ReadingTask:
-    """The task that reads: the tick `since` which it has read without a pause.
+    """The reading task, as its silence watches see it.
 
-    After a pause of this task or of the clock, all messages are old but no writer is silent.
-    `troubles` counts reads that failed or found a bad message. `now` returns the clock's tick;
-    None: no read is ever late. `inbox` is that of its board, None if nothing interrupts it.
+    After a pause of this task or of the clock, all messages are old although no writer is silent.
+
+    Attributes:
+        since: Tick since which the task has read without a pause.
+        troubles: Number of reads that failed or found a bad message.
+        now: Function that returns the clock's tick, or None if no read is ever late.
+        inbox: Inbox of the task's board. None if nothing interrupts it.
     """
 
     def __init__(self, inbox: BoardInbox | None = None) -> None:
@@ -42,7 +46,7 @@ class ReadingTask:
         self._step = NOT_YET
 
     def reads(self, tick: int) -> None:
-        """Note a read of a task that does not know how many cycles it skipped."""
+        """Record a read at `tick`, and detect pauses from the distance to the last read."""
         step = tick - self._last
         if step != self._step:
             if step > self._step:
@@ -55,7 +59,7 @@ class ReadingTask:
 class SilenceWatch(MessageWatch):
     """Judges the messages and the silence of one mailbox for one reader.
 
-    Ask `is_lost` once the newest message is `quiet` ticks old.
+    Call `is_lost` once the newest message is `quiet` ticks old.
     """
 
     def __init__(
@@ -75,8 +79,9 @@ class SilenceWatch(MessageWatch):
         self._reported: dict[Alarm, int] = {}
 
     def is_lost(self, tick: int) -> bool:
-        """Say whether the writer is lost or has been silent for too long; raise an alarm if the
-        cause is proven.
+        """Check whether the writer is lost or has been silent for too long.
+
+        An alarm is raised if the cause is proven.
         """
         if max_age := self._reader.spec.max_age:
             box = self._slots.box
@@ -86,7 +91,7 @@ class SilenceWatch(MessageWatch):
         age = tick - newest
         if age >= self.quiet:
             pid = pid_of(self._slots.box[Box.CLAIMANT])
-            # The loss may be marked already, and a new process may exist that does not cycle yet.
+            # The loss may already be marked, and a new process may exist that has not cycled yet.
             if age >= self._stale_after and (
                 self._block[Block.LOST] or state_of(pid) in GONE + STOPPED
             ):
@@ -98,36 +103,34 @@ class SilenceWatch(MessageWatch):
         return self.is_writer_lost(tick)
 
     def is_writer_lost(self, tick: int) -> bool:
-        """Say whether the writer is lost, however old its messages are."""
-        # From the tick after the loss: within that tick the answer would depend on which process is
-        # faster.
+        """Check whether the writer is lost, however old its messages are."""
+        # A loss counts from the next tick on. Within its tick the answer would depend on which
+        # process is faster.
         return self._reader.newest != NOT_YET and 0 < self._block[Block.LOST] <= tick
 
     def _is_mute(self, tick: int) -> bool:
-        """Say whether the writer has finished a release that writes a message, and the newest is of
-        an earlier one.
-        """
+        """Check whether the writer has finished a writing release without its message."""
         accesses = self._reader.accesses
         if any(
             self._episodes.is_open(code, accesses, tick)
             for code in (Alarm.HELD_BACK, Alarm.DISORDER)
         ):
-            # Messages come, but late.
+            # The writer sends messages, but they come late.
             return False
-        # In this order: a writer publishes before it reports the cycle as finished.
+        # The order matters, because a writer publishes before it reports the cycle as finished.
         finished = self._cycles.finished
         slots = self._slots
         head = slots.box[0]
-        # A serial without a message was lost on the way, not suppressed.
+        # A serial without a message counts as written: the message was lost, not suppressed.
         spec = self._reader.spec
         due = finished - (finished + spec.ahead - spec.phase) % spec.every
-        # The writer may have been away at that release: dead, late, or not released by the clock.
+        # The writer may not have run that release: it was dead, late, or not released by the clock.
         if self._cycles.ended_ns(due) is None:
             return False
         return slots.copy(head) and slots.serial == head and slots.tick < due
 
     def _report(self, code: Alarm, tick: int, age: int) -> None:
-        """Raise the alarm once for each last message: the next good message ends the episode."""
+        """Raise the alarm once per last good message. The next good message ends the episode."""
         serial = self._reader.serial
         if self._reported.get(code) != serial:
             self._reported[code] = serial

@@ -1,6 +1,4 @@
-"""Readers that watch their mailbox: every read also checks for damaged, late, forged and missing
-messages.
-"""
+"""Readers that also check their mailbox for damaged, late, forged and missing messages."""
 
 from __future__ import annotations
 
@@ -30,11 +28,18 @@ def watched(
     room: Callable[[], int] = lambda: ALL,
     asynchronous: bool = False,
 ) -> Watched:
-    """Open a mailbox for a task, with the checks that suit its writer: messages of the clock have
-    no period.
+    """Open a mailbox for a task, with the checks that suit its writer.
 
-    `room`: how many messages of a queue to take, asked before each read. `asynchronous`: the task
-    gets each message as soon as it is whole, under any other protocol.
+    Messages of the clock have no period, so their silence is not checked.
+
+    Args:
+        segment: Memory of the rack.
+        name: Name of the mailbox.
+        alarms: Alarm ring of the task.
+        task: The reading task.
+        room: Returns the number of messages to take from a queue. Called before each read.
+        asynchronous: True to read each message as soon as it is complete, under any protocol
+            except queue.
     """
     spec = segment.layout.mailbox(name)
     if spec.protocol == "queue":
@@ -45,7 +50,7 @@ def watched(
 
 
 class Watched(ABC):
-    """Base of the readers that watch a mailbox for a task, and raise the task's alarms about it."""
+    """Base of readers that watch a mailbox for a task and raise the task's alarms about it."""
 
     def __init__(
         self, segment: Segment, reader: Reader, alarms: AlarmWriter, task: ReadingTask
@@ -58,97 +63,92 @@ class Watched(ABC):
 
     @abstractmethod
     def read(self, tick: int) -> Reading[AnyMessage]:
-        """Return the newest message visible at `tick`, with its verdict, and whether its writer is
-        lost.
+        """Return the newest message visible at `tick`, with its verdict.
+
+        The reading also tells whether the writer is lost.
         """
 
     @abstractmethod
     def is_writer_lost(self, tick: int) -> bool:
-        """Say whether the writer is lost, without a read."""
+        """Check whether the writer is lost, without a read."""
 
     @property
     def _has_trouble(self) -> bool:
-        """Whether the last read failed, or found a bad message."""
+        """True if the last read failed or found a bad message."""
         return self._statistics.bad_reads != self._reported.bad_reads
 
     def _report(self, tick: int) -> None:
-        """Count the last read, a bad one, for the task; raise alarms for a damaged or forged
-        message.
-        """
-        found = self._statistics
+        """Count a bad read for the task, and raise alarms for a damaged or forged message."""
+        statistics = self._statistics
         accesses = self.reader.accesses
         self._task.troubles += 1
-        if found.corrupt != self._reported.corrupt:
+        if statistics.corrupt != self._reported.corrupt:
             self._episodes.find(Alarm.DAMAGED, accesses, tick)
-        if found.forged != self._reported.forged:
-            self._episodes.find(Alarm.MASQUERADE, accesses, tick, found.forger)
-        self._reported = copy(found)
+        if statistics.forged != self._reported.forged:
+            self._episodes.find(Alarm.MASQUERADE, accesses, tick, statistics.forger)
+        self._reported = copy(statistics)
 
 
 class WatchedReader(Watched):
-    """Reads a mailbox that is written by ticks. A clean read costs a few comparisons more."""
+    """Reader of a mailbox that is written by ticks. A clean read costs a few comparisons more."""
 
     def __init__(
         self, segment: Segment, reader: Reader, alarms: AlarmWriter, task: ReadingTask
     ) -> None:
         super().__init__(segment, reader, alarms, task)
-        self._watch = SilenceWatch(segment, reader, self._episodes, task)
-        self.late_from = self._watch.late_from
-        self.quiet = self._watch.quiet
+        self.watch = SilenceWatch(segment, reader, self._episodes, task)
         self.writer = segment.block(reader.spec.writer)
         """Control block of the mailbox's writer."""
         self._lost = {verdict: Reading(reader.message, verdict, True) for verdict in Verdict}
 
     def read(self, tick: int) -> Reading[AnyMessage]:
-        """Return the newest message visible at `tick`, with its verdict, and whether its writer is
-        lost.
+        """Return the newest message visible at `tick`, with its verdict.
+
+        The reading also tells whether the writer is lost.
         """
         reader = self.reader
         reading = reader.read(tick)
         return self.conclude(
             tick,
             reading,
-            is_odd=self._has_trouble or reader.found != self._watch.seen,
-            is_silent=tick - reader.newest >= self.quiet or self.writer[Block.LOST] > 0,
+            is_odd=self._has_trouble or reader.found != self.watch.seen,
+            is_silent=tick - reader.newest >= self.watch.quiet or self.writer[Block.LOST] > 0,
         )
 
     def conclude(
         self, tick: int, reading: Reading[AnyMessage], *, is_odd: bool, is_silent: bool
     ) -> Reading[AnyMessage]:
-        """Return a reading as this read gives it.
+        """Judge the result of a read, and return the reading for the level.
 
         Args:
             tick: Release tick of the reading cycle.
-            reading: What the reader itself gives.
-            is_odd: Whether messages are to be judged.
-            is_silent: Whether the writer's silence is.
+            reading: Result of the reader itself.
+            is_odd: True if messages must be judged.
+            is_silent: True if the writer's silence must be judged.
         """
         if is_odd:
-            self._watch.judge(tick)
+            self.watch.judge(tick)
         if self._has_trouble:
             self._report(tick)
-        if is_silent and self._watch.is_lost(tick):
+        if is_silent and self.watch.is_lost(tick):
             return self._lost[reading.verdict]
         return reading
 
     def is_writer_lost(self, tick: int) -> bool:
-        """Say whether the writer is lost, without a read."""
-        return self._watch.is_writer_lost(tick)
+        """Check whether the writer is lost, without a read."""
+        return self.watch.is_writer_lost(tick)
 
 
 class SporadicReader(Watched):
-    """Reads an operator's mailbox: silence there proves nothing, but messages must be whole, and
-    the clock's.
+    """Reader of an operator's mailbox, written by the clock, whose silence proves nothing.
 
     A command may leave part of an earlier one in force, so none is skipped: the newest comes with
-    the unread ones before it. The first read returns all that the slots hold, since a restarted
-    board must know them.
+    the unread ones before it. The first read returns all messages that the slots hold, because a
+    restarted board must know them.
     """
 
     def read(self, tick: int) -> Reading[AnyMessage]:
-        """Return the newest message visible at `tick`, with its verdict, and the unread ones before
-        it.
-        """
+        """Return the newest message visible at `tick`, with the unread ones before it."""
         before = self.reader.serial
         reading = self.reader.read(tick)
         if self._has_trouble:
@@ -161,10 +161,10 @@ class SporadicReader(Watched):
 
 
 class WatchedQueue(Watched):
-    """Reads a queue, as many messages as the task has `room` for.
+    """Reader of a queue, which takes as many messages as the task has room for.
 
-    Silence proves nothing, since a queue is written on demand. Only a writer found dead or hanging
-    counts as lost.
+    Silence proves nothing, because a queue is written on demand. Only a writer found dead or
+    hanging counts as lost.
     """
 
     reader: QueueReader
@@ -183,7 +183,7 @@ class WatchedQueue(Watched):
         self._writer = segment.block(reader.spec.writer)
 
     def read(self, tick: int) -> Reading[AnyMessage]:
-        """Take the messages visible at `tick`; the reading says whether their writer is lost."""
+        """Take the messages visible at `tick`, and check whether their writer is lost."""
         reader = self.reader
         reading = reader.take(tick, self._room(), self._task.now())
         if self._has_trouble or reader.taken != self._messages.seen:
@@ -193,31 +193,30 @@ class WatchedQueue(Watched):
         return reading._replace(is_lost=True) if self.is_writer_lost(tick) else reading
 
     def is_writer_lost(self, tick: int) -> bool:
-        """Say whether the writer is lost."""
-        # From the tick after the loss: within that tick the answer would depend on which process is
-        # faster.
+        """Check whether the writer is lost."""
+        # A loss counts from the next tick on. Within its tick the answer would depend on which
+        # process is faster.
         return 0 < self._writer[Block.LOST] <= tick
 
 
 class GridReader:
-    """Reads a mailbox at the ticks of a grid only; in between, the last reading stands and the bus
-    is not accessed.
+    """Reads a mailbox only at the ticks of a grid, and repeats the last reading in between.
 
-    A read that falls into a skipped cycle is left out. So a restarted task reads at the same ticks
-    as before.
+    A read that falls into a skipped cycle is omitted. A restarted task therefore reads at the same
+    ticks as before.
     """
 
     def __init__(self, watched: Watched, grid: TickGrid) -> None:
         self.reader = watched.reader
         self._watched, self._every, self._phase = watched, *grid
-        kept = [Reading(self.reader.message, verdict) for verdict in (Verdict.NONE, Verdict.OLD)]
-        self._kept = [(reading, reading._replace(is_lost=True)) for reading in kept]
+        repeated = [
+            Reading(self.reader.message, verdict) for verdict in (Verdict.NONE, Verdict.OLD)
+        ]
+        self._kept = [(reading, reading._replace(is_lost=True)) for reading in repeated]
         self._was_lost = False
 
     def read(self, tick: int) -> Reading[AnyMessage]:
-        """Return the newest message visible at `tick` if it is due, otherwise that of the last
-        read.
-        """
+        """Read the mailbox if a read is due at `tick`, otherwise repeat the last reading."""
         if (tick - self._phase) % self._every == 0:
             reading = self._watched.read(tick)
             self._was_lost = reading.is_lost

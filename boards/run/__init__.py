@@ -1,1 +1,1 @@
-"""What runs on a board: its cycle, its task, its clock."""
+"""Cycle of a board: tasks, ports, stopwatch, system controller and snapshots."""

@@ -1,5 +1,7 @@
-"""The attributes of a level as plain data, for people: its own, and of the objects in them what has
-changed since the level was built. Programs, configs and views of shared memory are left out.
+"""Attributes of a level as plain data, for people.
+
+The view contains the level's attributes and, for objects in them, the attributes that have changed
+since the level was built. Programs, configs and views of shared memory are left out.
 """
 
 from __future__ import annotations
@@ -19,28 +21,29 @@ from rack.backplane.segment import Segment
 from rack.boards.run.settings import attribute_names, has_attributes
 
 MOST = 24
-"""Numbers of an array, or items, that are shown; of larger ones the size."""
+"""Maximum number of array elements or items that are shown. Of larger ones the size is shown."""
 DEPTH = 5
-"""Objects within objects, at most."""
+"""Maximum nesting of objects."""
 OMITTED = (ByteLock, Layout, Segment)
-"""Objects that are never shown."""
+"""Classes of objects that are never shown."""
 _NOTHING = object()
 
 
 class ObjectAttributes(dict[str, Any]):
-    """The attributes of an object, unlike the items of a mapping."""
+    """Attributes of an object, as distinct from the items of a mapping."""
 
 
 class AttributeView:
-    """What a level shows of itself; make it when the level is built."""
+    """View of a level's attributes. Create it when the level is built."""
 
     def __init__(self, level: object) -> None:
         self._level = level
         self._built = _Reading().attributes(level, DEPTH)
 
     def show(self) -> Mapping[str, Any]:
-        """Return its attributes by name, as JSON holds them: numbers, texts, lists, and objects as
-        dictionaries of theirs.
+        """Return the attributes by name, as JSON values.
+
+        These are numbers, texts, lists, and dictionaries for objects.
         """
         now = _Reading().attributes(self._level, DEPTH)
         return _present(
@@ -52,7 +55,7 @@ class AttributeView:
 
 
 def _changed(now: Any, built: Any) -> Any:
-    """Return what is news in an object's attributes."""
+    """Return the attributes of an object that differ from the built object."""
     if not isinstance(now, ObjectAttributes) or not isinstance(built, ObjectAttributes):
         return _NOTHING if now == built else now
     changes = ((name, _changed(value, built.get(name, _NOTHING))) for name, value in now.items())
@@ -60,11 +63,12 @@ def _changed(now: Any, built: Any) -> Any:
 
 
 def _present(items: Iterable[tuple[str, Any]]) -> dict[str, Any]:
+    """Return the items as a dictionary, without omitted values."""
     return {name: value for name, value in items if value is not _NOTHING}
 
 
 class _Reading:
-    """One look at objects, each at the first place that leads to it."""
+    """One pass over objects, each shown only at the first place that leads to it."""
 
     def __init__(self) -> None:
         self._seen: set[int] = set()
@@ -78,13 +82,14 @@ class _Reading:
         return ObjectAttributes(_present(plain))
 
     def _plain(self, thing: Any, depth: int) -> Any:
+        """Return a value as plain data, or `_NOTHING` if it is not shown."""
         match thing:
             case Enum():
                 return thing.name.lower()
             case bytes() | bytearray():
                 return thing.hex() if b"\x00" in thing else text_of(thing)
             case float() if not isfinite(thing):
-                # JSON has no word for it.
+                # JSON has no representation of these values.
                 return str(thing)
             case None | bool() | str() | int() | float():
                 return thing
@@ -100,7 +105,7 @@ class _Reading:
         return self.attributes(thing, depth - 1) or _NOTHING
 
     def _array(self, array: Any, depth: int) -> Any:
-        """Return an array, a number of numpy, or a record."""
+        """Return an array, a numpy number or a record as plain data."""
         if array.size > MOST:
             sizes = " x ".join(map(str, array.shape))
             return f"{sizes} of {array.dtype.name}"
@@ -111,6 +116,7 @@ class _Reading:
         return {name: self._array(array[name], depth) for name in array.dtype.names}
 
     def _items(self, thing: Any, depth: int) -> Any:
+        """Return a collection as plain data, or its size if it is too large."""
         if len(thing) > MOST:
             return f"{len(thing)} items"
         if isinstance(thing, Mapping):

@@ -38,16 +38,31 @@ from rack.levels.level import Executor, Planner
 SELF_TEST_FAILED = 3
 """Exit status of a board whose start-up test failed."""
 REPEATS = 1 << 16
-"""Factor of the place, a checksum, in the word of a failure; the count of repeats is the rest."""
+"""Factor by which the word of a failure combines place and number of repeats.
+
+The word is the place, a checksum, times this factor, plus the number of repeats.
+"""
 FAST_NS = 10_000_000
-"""Longest cycle for which memory is touched in advance: that takes a tenth of a second, and longer
-cycles have time for page faults."""
+"""Longest cycle for which memory is touched in advance.
+
+Touching takes a tenth of a second, and longer cycles have time for page faults.
+"""
 
 
 def enter(crate: int, name: str, segment: Segment, board: Callable[[Segment], int]) -> int:
-    """Run `board` in a process forked by the crate; return its exit status."""
+    """Run a board in a process forked by the crate.
+
+    Args:
+        crate: Process id of the crate.
+        name: Name of the board.
+        segment: Memory of the rack.
+        board: Function that runs the board and returns its exit status.
+
+    Returns:
+        The exit status of the process.
+    """
     die_with_parent(crate)
-    # A board drops the crate's priority and takes its own when it is ready.
+    # Drop the crate's priority. The board takes another priority when it is ready.
     set_priority(0)
     name_process(f"{segment.rack}:{name}")
     try:
@@ -61,26 +76,33 @@ def enter(crate: int, name: str, segment: Segment, board: Callable[[Segment], in
 
 
 def _describe_failure(segment: Segment, name: str, error: Exception) -> str:
-    """Return the traceback of an error; where it ended the board's last process in the same place,
-    only how often it has come again.
+    """Describe an error by its traceback.
+
+    If the board's previous process ended in the same place, only the number of repeats is given.
     """
     if name in segment.map.blocks:
         block = segment.block(name)
         place = crc32("".join(traceback.format_tb(error.__traceback__)).encode())
-        last_place, again = divmod(block[Block.FAILED], REPEATS)
-        again = again + 1 if place == last_place else 0
-        block[Block.FAILED] = place * REPEATS + again
-        if again:
+        last_place, repeats = divmod(block[Block.FAILED], REPEATS)
+        repeats = repeats + 1 if place == last_place else 0
+        block[Block.FAILED] = place * REPEATS + repeats
+        if repeats:
             reason = "".join(traceback.format_exception_only(error)).rstrip()
-            return f"board '{name}' failed in the same place, {again} more so far: {reason}"
+            return f"board '{name}' failed again in the same place ({repeats} repeats): {reason}"
     return f"board '{name}' failed:\n{traceback.format_exc().rstrip()}"
 
 
 def run_task_board(segment: Segment, wiring: TaskWiring, attention: int, copies: socket) -> int:
     """Build a task's level, test it, take the processor, and cycle until the run is over.
 
-    `attention` is an eventfd on which the Rack waits: a board writes to it when it is ready or
-    raises an alarm. `copies`: the line on which the crate is told of its copies.
+    Args:
+        segment: Memory of the rack.
+        wiring: Wiring of the task.
+        attention: eventfd that wakes the Rack when the board is ready or raises an alarm.
+        copies: Socket on which the crate is told of copies of the process.
+
+    Returns:
+        The exit status of the board.
     """
     block = segment.block(wiring.task)
     block[Block.PID] = os.getpid()
@@ -96,6 +118,7 @@ def run_task_board(segment: Segment, wiring: TaskWiring, attention: int, copies:
 
 
 def _run_level(segment: Segment, wiring: TaskWiring, attention: int, copies: socket) -> None:
+    """Build and test the level of a task, then run its cycles."""
     spec = segment.layout.task(wiring.task)
     copier = Copier(segment, wiring.task, copies) if takes_snapshots(segment) else None
     block = segment.block(wiring.task)
@@ -113,8 +136,8 @@ def _run_level(segment: Segment, wiring: TaskWiring, attention: int, copies: soc
         is_fast = spec.every * segment.layout.clock_ns <= FAST_NS
         lockstep = bool(segment.words[System.LOCKSTEP])
         if is_fast and spec.priority and not lockstep:
-            # Still at ordinary priority: a board that is restarted must not delay another board's
-            # cycle.
+            # This is done at ordinary priority, because a restarted board must not delay another
+            # board's cycle.
             touch_memory()
         block[Block.PRIORITY] = take_core(spec.core, spec.priority, wiring.reservation)
         wake_up_exactly()
@@ -134,17 +157,27 @@ def _run_level(segment: Segment, wiring: TaskWiring, attention: int, copies: soc
         task.stopwatch.notify_clock()
         task.run()
     finally:
-        # From here at ordinary priority: closing files must not delay another board's cycle.
+        # Continue at ordinary priority, because closing files must not delay another board's cycle.
         set_priority(0)
         level.close()
 
 
 def run_clock_board(segment: Segment, wiring: ClockWiring, attention: int, copies: socket) -> int:
-    """Take the processor and run the system clock."""
+    """Take the processor and run the system clock until the run is over.
+
+    Args:
+        segment: Memory of the rack.
+        wiring: Wiring of the clock.
+        attention: eventfd that wakes the Rack.
+        copies: Socket on which the crate is told of copies of the process.
+
+    Returns:
+        The exit status of the board.
+    """
     copier = Copier(segment, CLOCK, copies) if takes_snapshots(segment) else None
     take_core(wiring.core, wiring.priority, wiring.reservation)
-    # Not touched: every board waits for the clock's start, and its lead over the grid has room for
-    # a page fault.
+    # The memory is not touched in advance, because every board waits for the clock's start, and its
+    # lead over the grid has room for a page fault.
     hold_memory(wiring.lockstep)
     with cores_kept_awake() if wiring.keeps_awake else nullcontext():
         run_clock(segment, wiring, attention, copier)

@@ -1,9 +1,9 @@
-"""Mailboxes read and written by machine code: one call for all ports of a step of the cycle.
+"""Mailboxes accessed by compiled code, with one call for all ports of a step of the cycle.
 
-A call does what `WatchedReader.read` and `OutputPort.write` do in the usual case, on the same
-memory: the slots, the local records, and the words of a reader's state. What is rare (the first
-message of a writer, a damaged, lost or forged one, a silent writer) it leaves as it was, and says
-so: then the Python classes do it, which remain the reference.
+A call does the same as `WatchedReader.read` and `OutputPort.write` in the usual case, on the same
+memory: the slots, the local records, and the words of a reader's state. In rare cases (the first
+message of a writer, a damaged, lost or forged message, a silent writer) it changes nothing and
+reports the port. The Python classes, which remain the reference, handle it then.
 
 Loads and stores of heads are atomic, with acquire and release: see `rack.backplane.mailbox.slots`.
 Addresses stay valid in a fork and in a copy of a board, whose memory is at the same place.
@@ -11,69 +11,80 @@ Addresses stay valid in a fork and in a copy of a board, whose memory is at the 
 
 from __future__ import annotations
 
-import sys
 from typing import Any
 
 import numpy as np
 
+from rack.backplane.mailbox.mailbox import GOOD, NOT_YET
 from rack.backplane.mailbox.slots import CHECKED_FROM, EPOCH_BITS, SIGNED_FROM, Slots
 from rack.backplane.words import Slot
 from rack.boards.run.instructions import (
     copy,
     fence,
+    instruction,
     load,
-    record_at,
+    pointer,
     store_release,
     xxh3,
 )
-from rack.levels.compiled import compiled, compiled_for, preload
+from rack.levels.compiled import compiled, compiled_for
 
 
 def _words(*names: str) -> np.dtype:
+    """Build a numpy dtype of 64-bit words."""
     return np.dtype([(name, "i8") for name in names])
 
 
-READ_PORT = _words(
-    # Addresses: the mailbox's head and first slot; the state, the last good message and the local
-    # record of its reader; the word that says that the writer is lost.
-    *("head", "slots", "state", "good", "record", "lost"),
-    *("stride", "depth", "size"),  # of slots; bytes from one to the next, and bytes in use
-    "is_sliced",  # whether messages are visible by ticks
-    "is_watched",  # whether messages are taken and judged here, or Python takes them
-    *("late_from", "quiet"),  # ticks
-    "result",  # of the last read
-)
-"""A mailbox to read."""
-WRITE_PORT = _words(
-    # Addresses: the mailbox's head and first slot; the local record of the writer; the addresses of
-    # the states of the readers that its message rests on.
-    *("head", "slots", "record", "sources"),
-    *("source_count", "stride", "depth", "size"),
-    *("every", "ahead", "delay"),  # ticks; the last until a message is visible
-    "intruder",  # process that has published since this writer's last message; 0: none
-)
-"""A mailbox to write."""
-STATE = _words(
-    *("serial", "found", "newest", "visible", "basis", "accesses", "transfers", "signature"),
-    *("judged", "judged_tick"),
-)
-"""The words of a reader: see `ReaderState`."""
 SLOT = _words("stamp", "signature", "chain", "check", "basis", "serial", "tick", "visible")
-"""The words of a slot's head: see `rack.backplane.words.Slot`."""
+"""Words of a slot's head: see `rack.backplane.words.Slot`."""
+STATE = _words("found", "accesses", "transfers", "judged", "judged_tick", *(SLOT.names or ()))
+"""Words of a reader's state: see `Reader`."""
+PORT = _words(
+    # Addresses of the mailbox's head, of its first slot, and of the local record of its reader or
+    # writer.
+    "head",
+    "slots",
+    "record",
+    # Of the slots: distance in bytes, number, and bytes in use.
+    "stride",
+    "depth",
+    "size",
+    # To read: addresses of the reader's state and of the word that marks the writer as lost,
+    # whether messages are visible by ticks, and whether compiled code takes and judges them.
+    "state",
+    "lost",
+    "is_sliced",
+    "is_watched",
+    "late_from",
+    "quiet",  # ticks
+    # To write: address and length of an array with the addresses of the states of the readers on
+    # whose messages the written message depends.
+    "sources",
+    "source_count",
+    # Period, 0 for a mailbox to read; phase; time until a message is visible. In ticks.
+    "every",
+    "ahead",
+    "delay",
+    # Result of the last read, or the process of an intruder found by the last write.
+    "result",
+)
+"""Record of a mailbox to read or to write."""
 _SIGNATURE = 8 * Slot.EPOCH
 _VISIBLE = 8 * Slot.VISIBLE_AT
-_READ_SIZE = READ_PORT.itemsize
-_WRITE_SIZE = WRITE_PORT.itemsize
+_PORT_SIZE = PORT.itemsize
 OLD, NEW, ODD, SILENT, SLOW = 0, 1, 2, 4, 8
-"""Results of a read. ODD, SILENT: Python judges messages, silence. SLOW: Python reads."""
+"""Results of a read.
+
+The last three ask Python to judge the messages, to judge the silence, or to do the read itself.
+"""
 MOST_PORTS = 60
-"""Most ports of a table: each has a bit in the answer of a call."""
+"""Maximum number of ports of a table, since each has a bit in the result of a call."""
 
 
-read_port_at = record_at(READ_PORT)
-write_port_at = record_at(WRITE_PORT)
-state_at = record_at(STATE)
-slot_at = record_at(SLOT)
+# Functions that give compiled code the record at an address.
+port_at = instruction(pointer, PORT)
+state_at = instruction(pointer, STATE)
+slot_at = instruction(pointer, SLOT)
 
 
 @compiled
@@ -84,46 +95,35 @@ def slot_of(port: Any, serial: int) -> int:
 
 
 @compiled
-def find_visible(port: Any, last: int, head: int, tick: int) -> int:
-    """Return the serial of the newest message visible at `tick`, not before `last`."""
-    serial = head
-    oldest = max(last, head - port.depth)
-    while serial > oldest and load(slot_of(port, serial) + _VISIBLE) > tick:
-        serial -= 1
-    return serial
-
-
-@compiled
 def take(port: Any, serial: int) -> bool:
-    """Take a good message of the writer of the last one; leave any other: see `Reader._obtain`."""
+    """Accept a good message of the same writer as before, as `Reader._fetch_good` does.
+
+    Any other message is left to Python.
+    """
     slot = slot_of(port, serial)
     copy(port.record, slot, SIGNED_FROM)
     fence()
     copy(port.record + SIGNED_FROM, slot + SIGNED_FROM, port.size - SIGNED_FROM)
-    found = slot_at(port.record)
+    received = slot_at(port.record)
     state = state_at(port.state)
-    if found.serial != serial or found.signature != state.signature:
+    if received.serial != serial or received.signature != state.signature:
         return False
-    check: int = xxh3(port.record + CHECKED_FROM, port.size - CHECKED_FROM, found.chain)
-    if check != found.check:
+    check: int = xxh3(port.record + CHECKED_FROM, port.size - CHECKED_FROM, received.chain)
+    if check != received.check:
         return False
-    copy(port.good, port.record, port.size)
-    state.serial = serial
-    state.newest = found.tick
-    state.visible = found.visible
-    state.basis = found.basis
+    copy(port.state + GOOD, port.record, port.size)
     state.transfers += 1
     return True
 
 
 @compiled
-def read_port(address: int, tick: int) -> int:
-    """Read one mailbox as `WatchedReader.read` does; return the result."""
-    port = read_port_at(address)
+def read_port(port: Any, tick: int) -> int:
+    """Read one mailbox as `WatchedReader.read` does, and return the result."""
     state = state_at(port.state)
     serial = load(port.head)
-    if port.is_sliced:
-        serial = find_visible(port, state.serial, serial, tick)
+    oldest = max(state.serial, serial - port.depth)
+    while port.is_sliced and serial > oldest and load(slot_of(port, serial) + _VISIBLE) > tick:
+        serial -= 1
     result = OLD
     if serial != state.serial:
         if not port.is_watched or not take(port, serial):
@@ -132,60 +132,25 @@ def read_port(address: int, tick: int) -> int:
     state.accesses += 1
     state.found = serial
     if port.is_watched:
-        # Usually nothing is new, or the next message is there, released later, in time.
+        # Usually nothing is new, or the next message has come in time with a later release.
         if 0 <= state.judged == serial - 1 and (
-            state.judged_tick < state.newest > state.visible - port.late_from
+            state.judged_tick < state.tick > state.visible - port.late_from
         ):
             state.judged = serial
-            state.judged_tick = state.newest
+            state.judged_tick = state.tick
         elif serial != state.judged:
             result |= ODD
-        if tick - state.newest >= port.quiet or load(port.lost):
+        if tick - state.tick >= port.quiet or load(port.lost):
             result |= SILENT
     return result
 
 
-@compiled_for("i8, i8, i8")
-def read_ports(table: int, count: int, tick: int) -> int:
-    """Read mailboxes as of a tick.
-
-    Args:
-        table: Address of the ports, of type `READ_PORT`.
-        count: Number of them.
-        tick: Release tick of the cycle.
-
-    Returns:
-        A bit for each port that Python must look at: its result has changed, or is not an ordinary
-        one.
-    """
-    touched = 0
-    for at in range(count):
-        address = table + at * _READ_SIZE
-        result = read_port(address, tick)
-        port = read_port_at(address)
-        if result > NEW or result != port.result:
-            touched |= 1 << at
-        port.result = result
-    return touched
-
-
-@compiled
-def basis_of(port: Any, tick: int) -> int:
-    """Return the tick of the oldest information that a message rests on."""
-    basis = tick
-    is_first = True
-    for at in range(port.source_count):
-        state = state_at(load(port.sources + 8 * at))
-        if state.serial and (is_first or state.basis < basis):
-            basis = state.basis
-            is_first = False
-    return basis
-
-
 @compiled
 def publish(port: Any, tick: int, stamp: int) -> int:
-    """Publish the message of a port's record; return the process of an intruder, 0: none. See
-    `Slots.publish`.
+    """Publish the message of a port's record as `Slots.publish_message` does.
+
+    Returns:
+        Process id of an intruder, 0 for none.
     """
     record = slot_at(port.record)
     before = record.serial
@@ -193,14 +158,19 @@ def publish(port: Any, tick: int, stamp: int) -> int:
     intruder = 0
     if load(port.head) != before:
         intruder = load(slot + _SIGNATURE) >> EPOCH_BITS
+    basis = NOT_YET
+    for at in range(port.source_count):
+        state = state_at(load(port.sources + 8 * at))
+        if state.serial:
+            basis = min(basis, state.basis)
     record.stamp = stamp
-    record.basis = basis_of(port, tick)
+    record.basis = tick if basis == NOT_YET else basis
     record.serial = before + 1
     record.tick = tick
     record.visible = tick + port.delay
     record.chain = record.check
     record.check = xxh3(port.record + CHECKED_FROM, port.size - CHECKED_FROM, record.chain)
-    # In this order: the previous head, the message, its signature, this head.
+    # The order of stores is: the previous head, the message, its signature, this head.
     fence()
     copy(slot + SIGNED_FROM, port.record + SIGNED_FROM, port.size - SIGNED_FROM)
     fence()
@@ -210,38 +180,40 @@ def publish(port: Any, tick: int, stamp: int) -> int:
 
 
 @compiled_for("i8, i8, i8, i8")
-def write_ports(table: int, count: int, tick: int, stamp: int) -> bool:
-    """Write the messages that are due.
+def access_ports(table: int, count: int, tick: int, stamp: int) -> int:
+    """Read mailboxes as of a tick, and write the messages that are due.
 
     Args:
-        table: Address of the ports, of type `WRITE_PORT`.
-        count: Number of them.
+        table: Address of the ports, of type `PORT`.
+        count: Number of ports.
         tick: Release tick of the cycle, whose end has not come.
-        stamp: CLOCK_MONOTONIC, ns.
+        stamp: Time stamp of written messages, in ns of CLOCK_MONOTONIC.
 
     Returns:
-        Whether a port has an intruder.
+        A bit for each port that Python must handle, because its result is new or unusual.
     """
-    is_intruded = False
+    touched = 0
     for at in range(count):
-        port = write_port_at(table + at * _WRITE_SIZE)
-        if (tick + port.ahead) % port.every:
-            port.intruder = 0
-            continue
-        port.intruder = publish(port, tick, stamp)
-        is_intruded |= port.intruder > 0
-    return is_intruded
+        port = port_at(table + at * _PORT_SIZE)
+        result = 0
+        if port.every == 0:
+            result = read_port(port, tick)
+        elif (tick + port.ahead) % port.every == 0:
+            result = publish(port, tick, stamp)
+        if result > NEW or result != port.result:
+            touched |= 1 << at
+        port.result = result
+    return touched
 
 
 @compiled
 def order() -> None:
-    """Do what `Slots.fence` promises, on any processor."""
+    """Implement `Slots.fence` on any processor."""
     fence()
 
 
 def load_machine_code() -> None:
-    """Load all of it, compiled or from the cache: once, before a crate forks its boards."""
-    preload(sys.modules[__name__])
-    ordering: Any = order.load()
-    ordering.compile(())
-    Slots.fence = staticmethod(ordering)  # type: ignore[method-assign]  # the reference needs none on x86-64
+    """Load the compiled functions of mailboxes, before a crate forks its boards."""
+    access_ports.preload()
+    Slots.fence = staticmethod(order.load())  # type: ignore[method-assign]  # the reference needs none on x86-64
+    Slots.fence()

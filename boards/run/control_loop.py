@@ -2,8 +2,8 @@
 
 `VirtualControlLoop` is its executor section and `PlannerLoop` its planner. The paper's `cobegin`
 becomes two processes: on one core, by priority (tightly coupled), or on two cores (loosely
-coupled). `lock` and `unlock` are inside the mailboxes, since only protocol `lock` needs them. The
-stopwatch keeps time stamps, trace and counts; faults take effect between cycles.
+coupled). `lock` and `unlock` are inside the mailboxes, because only protocol `lock` needs them. The
+stopwatch keeps time stamps, trace and counts. Faults take effect between cycles.
 """
 
 from __future__ import annotations
@@ -25,19 +25,18 @@ _DEMANDS = tuple(Demand)
 
 
 class VirtualControlLoop(Task):
-    """The executor section of `procedure level()`: one virtual control loop, at the higher
-    priority.
+    """The executor section of `procedure level()`, at the higher priority.
 
         repeat
-            waituntil(next-cycle); update(next-cycle)
-            lock; read_command; unlock; lock; read_status; unlock
-            read plan
-            process
-            lock; write_command; unlock; lock; write_status; unlock
+          waituntil(next-cycle); update(next-cycle)
+          lock; read_command; unlock; lock; read_status; unlock
+          read plan
+          process
+          lock; write_command; unlock; lock; write_status; unlock
         until forever
 
-    First, the exchange (C of fig. 4) transfers the plan over the bus from the planner's processor;
-    then it is at hand.
+    At the beginning of a cycle, the exchange (C of fig. 4) transfers the plan over the bus from the
+    planner's processor, so that the plan is available locally.
     """
 
     def __init__(
@@ -69,7 +68,7 @@ class VirtualControlLoop(Task):
         self.write_command_and_status = slowed(self.outputs.write, times.write_ns)
 
     def cycle(self, tick: int) -> None:
-        """Do the cycle released at `tick`."""
+        """Run the cycle released at `tick`."""
         watch = self.stopwatch
         deadline = tick + self._due
         watch.start(tick, self.next_cycle.skipped)
@@ -90,8 +89,9 @@ class VirtualControlLoop(Task):
         watch.finish(in_time, deadline, done=tick)
 
     def _handle_delay(self, tick: int) -> None:
-        """Note a pause in reading, in the first cycle too; in one that begins late, check the
-        clock.
+        """Record a pause in reading, and check the clock if the cycle begins late.
+
+        The first cycle counts as a pause too.
         """
         if self.next_cycle.skipped or not self._has_cycled:
             self.inputs.task.since = tick
@@ -100,9 +100,7 @@ class VirtualControlLoop(Task):
             self._guard.check_release(tick)
 
     def process(self, tick: int) -> None:
-        """Let the level process, given the demand on the arm; then report its findings and the
-        faults that acted.
-        """
+        """Run the level's `process`, then report its findings and the faults that acted."""
         executor = self.executor
         executor.demand = _DEMANDS[self.words[System.DEMAND]]
         executor.process(tick)
@@ -112,9 +110,10 @@ class VirtualControlLoop(Task):
             self._report(tick)
 
     def _report(self, tick: int) -> None:
+        """Raise alarms for the level's findings, and update the faults that act in the cycle."""
         executor = self.executor
         for finding in executor.findings:
-            # A level may raise its own findings in every cycle: an alarm is one per episode.
+            # A level may raise user-defined findings in every cycle. Raise one alarm per episode.
             if finding.alarm is not Alarm.OWN or self._begins_episode(finding.subject, tick):
                 self.alarms.ring(tick, *finding)
         executor.findings.clear()
@@ -123,18 +122,18 @@ class VirtualControlLoop(Task):
         self.faults.burn(tick)
 
     def _begins_episode(self, number: int, tick: int) -> bool:
-        """Note one of the level's own findings; return whether it begins an episode."""
+        """Record a user-defined finding. Returns True if it begins an episode."""
         last = self._raised.get(number)
         self._raised[number] = tick
         return last is None or tick - last > CLEAN_READS * self.spec.every
 
 
 class PlannerLoop(Task):
-    """The planner of `procedure level()`: plans in the background, each plan within its time slice.
+    """The planner of `procedure level()`: plans in the background, within its time slice.
 
         repeat
-            plan
-            lock; write_plan; unlock
+          plan
+          lock; write_plan; unlock
         until forever
 
     In every cycle it asks the level whether it wants a plan. If it is tightly coupled under
@@ -162,17 +161,18 @@ class PlannerLoop(Task):
         if not self.planner.wanted(tick):
             self._pass(tick)
             return
-        # Claim the slice of a plan: the clock does not release this task until its end.
+        # Claim the time slice of a plan, until whose end the clock does not release this task.
         self.next_cycle.hold_until(tick + self.slice)
         self.block[Block.DEADLINE] = tick + self.slice
         self.stopwatch.notify_clock()
         self.planner.plan(tick)
         self.faults.burn(tick)
         if self._critical_priority:
-            # The executor's own: it cannot preempt the update of the plan.
+            # At this priority the executor cannot preempt the update of the plan.
             set_priority(self._critical_priority)
         try:
-            # Stamped inside: before the section, and on leaving it, the executor may run first.
+            # Take the stamps inside the section. Before it and after it, the executor may run
+            # first.
             watch.process_ns = monotonic_ns()
             in_time = self.write_plan(tick, watch.now(tick + self.slice))
             watch.end_ns = monotonic_ns()
@@ -180,13 +180,14 @@ class PlannerLoop(Task):
             if self._critical_priority:
                 set_priority(self._priority)
         self.block[Block.PLANS] += 1
-        # A plan begun late gets its whole slice, and answers any release within it.
+        # A plan begun late gets its whole slice, and counts for every release within it.
         done = max(tick, min(self.block[Block.RELEASED], tick + self.slice - self.spec.every))
         watch.finish(in_time, tick + self.slice, done, Flag.PLANNED)
 
     def _pass(self, tick: int) -> None:
-        """Let a release pass without a plan; trace it if it came too late or others were
-        skipped.
+        """Let a release pass without a plan.
+
+        The cycle is traced if it came too late or other cycles were skipped.
         """
         self.outputs.flush(tick, self.clock.now())
         in_time = self.clock.now() < tick + self.slice

@@ -1,12 +1,12 @@
-"""Copies of a process, forked between two of its cycles: each waits until a rack goes on from it.
+"""Copies of a process, forked between two of its cycles, that wait until a rack continues them.
 
-A fork has all that a process knows, whatever it consists of. What it shares with the process that
-it is forked from, it gets for itself: files that are open for reading are opened again where they
-were read last. What cannot be had twice is refused: files open for writing, sockets, threads.
+A fork has all that the process knows. Resources that it would share with the parent are separated:
+files that are open for reading are opened again at the same position. A process with resources that
+cannot be duplicated is refused: files open for writing, sockets, threads.
 
-A copy that is to go on forks its successor, which waits as it did, and goes on itself. The crate is
-its parent by then, since the board that it was forked from has ended. A copy waits on a line
-whose other end only the crate holds: it ends when the crate does.
+A copy that is to continue forks its successor, which waits as the copy did, and then continues
+itself. At that time the crate is its parent, because the board from which it was forked has ended.
+A copy waits on a pipe whose other end only the crate holds, so it ends when the crate does.
 """
 
 from __future__ import annotations
@@ -34,18 +34,19 @@ from rack.boards.errors import SnapshotError
 from rack.levels.level import LevelContext
 
 MOST_BYTES = 4096
-"""Largest note of a board."""
+"""Maximum size of a board's note."""
 MOST_FILES = 2
+"""Maximum number of descriptors sent with a note."""
 _DESCRIPTORS = Path("/proc/self/fd")
 _THREADS = Path("/proc/self/task")
 
 
 @dataclass(frozen=True)
 class CopyNote:
-    """A board's note to the crate: the process `pid` is a copy of it before `tick`, and waits.
+    """Note of a board to the crate: process `pid` is a waiting copy of it before `tick`.
 
-    With it come the crate's end of its line and, from the clock, the memory of the segment. The
-    successor of a copy that goes on has its line already.
+    The crate's end of the copy's pipe is sent along and, from the clock, the memory of the segment.
+    The successor of a copy that continues already has its pipe.
     """
 
     tick: int
@@ -53,22 +54,30 @@ class CopyNote:
     pid: int
 
     def send(self, line: socket, *files: int) -> None:
-        """Send it with open files. Raises `OSError` when the crate is gone."""
+        """Send the note with open files.
+
+        Raises:
+            OSError: The crate has ended.
+        """
         send_fds(line, [encode_json(asdict(self)).encode()], files)
 
 
 def receive_note(line: socket) -> tuple[CopyNote, list[int]]:
-    """Return the next note, and the files that came with it."""
+    """Return the next note, and the files sent with it."""
     data, files, *_ = recv_fds(line, MOST_BYTES, MOST_FILES)
     return CopyNote(**json.loads(data)), files
 
 
 @dataclass(frozen=True)
 class GoOn:
-    """The crate's request to a copy: go on in the segment of `rack`, as a child of the crate, with
-    another `context` of the level if there is one.
+    """The crate's request to a copy to continue in the segment of `rack`.
 
     The other request, None, is answered with the attributes of the level as JSON.
+
+    Attributes:
+        crate: Process id of the crate, which is the parent of the copy.
+        rack: Name of the rack.
+        context: New context of the level, None to keep the present one.
     """
 
     crate: int
@@ -79,7 +88,7 @@ class GoOn:
 class Copier:
     """Forks copies of this process.
 
-    Make it before the level: what is open by then is not the level's.
+    Create it before the level, because files that are open at that time do not belong to the level.
     """
 
     def __init__(self, segment: Segment, name: str, line: socket) -> None:
@@ -95,12 +104,13 @@ class Copier:
         """Fork a copy before `tick`.
 
         Args:
-            tick: The tick that the copy begins with.
-            memory: Of the clock, the file with the segment's memory.
+            tick: First tick that the copy runs.
+            memory: For the clock, the file with the segment's memory.
             show: Returns the attributes of the level that the copy shows.
 
         Returns:
-            None in this process. In a copy, as often as a rack goes on from it, the request.
+            None in this process. In the copy, the request, each time that a rack continues from
+                it.
 
         Raises:
             SnapshotError: The process cannot be copied, with the reason.
@@ -118,11 +128,13 @@ class Copier:
             try:
                 pid = os.fork()
             except OSError as error:
-                raise SnapshotError(f"{self._name}: no copy: {error.strerror}") from None
+                raise SnapshotError(f"{self._name}: cannot be copied: {error.strerror}") from None
             if pid:
                 CopyNote(tick, self._name, pid).send(self._line, here.fileno(), *memory)
-                # Those that have ended since: they are this process's children.
-                self._copies = [one for one in self._copies if not os.waitpid(one, os.WNOHANG)[0]]
+                # Reap the copies that have ended, which are children of this process.
+                self._copies = [
+                    copy for copy in self._copies if not os.waitpid(copy, os.WNOHANG)[0]
+                ]
                 self._copies.append(pid)
                 return None
             here.close()
@@ -144,61 +156,71 @@ class Copier:
         seeds: Any,
         show: Callable[[], Mapping[str, Any]],
     ) -> tuple[GoOn, int]:
-        """Wait until a rack goes on from here; return the request, and the process that waits from
-        then on. End with the crate.
+        """Wait in a copy until a rack continues from it. The process ends with the crate.
+
+        Args:
+            crate: Pipe to the crate.
+            offsets: Positions of the files that are open for reading, by descriptor.
+            seeds: State of Python's random generator.
+            show: Returns the attributes of the level.
+
+        Returns:
+            The request, and the successor that waits from now on.
         """
         while True:
             for fd, offset in offsets.items():
                 # Open the file for this process alone, and read it up to `offset`.
-                again = os.open(f"/proc/self/fd/{fd}", os.O_RDONLY | os.O_CLOEXEC)
-                os.lseek(again, offset, os.SEEK_SET)
-                os.dup2(again, fd)
-                os.close(again)
-            # A fork gets new ones from Python.
+                reopened = os.open(f"/proc/self/fd/{fd}", os.O_RDONLY | os.O_CLOEXEC)
+                os.lseek(reopened, offset, os.SEEK_SET)
+                os.dup2(reopened, fd)
+                os.close(reopened)
+            # Python reseeds its generator in a fork.
             random.setstate(seeds)
             try:
-                # From the crate's own process, as is all that a board is told when it is forked.
+                # The request is trusted, because it comes from the crate.
                 request: GoOn | None = crate.recv()
                 if request is None:
                     crate.send_bytes(encode_json(show()).encode())
                 elif successor := os.fork():
                     return request, successor
             except (EOFError, OSError):
-                # The crate is gone, or the system refuses a fork, as the crate notices.
+                # The crate has ended, or the system refuses a fork, which the crate notices.
                 os._exit(os.EX_OSERR)
 
     def _refused(self, memory: Collection[int]) -> list[str]:
-        """Return what the process has that no copy can have; `memory`: files that are the
-        clock's.
+        """Describe the resources of the process that a copy cannot have.
+
+        Args:
+            memory: Files of the clock, which are permitted.
         """
         segment = os.fstat(self._segment.fd)
-        found = [
+        resources = [
             f"it holds {name}"
             for fd, name in _open_files().items()
             if self._before.get(fd) != name
             and fd not in memory
-            # A lock has the segment open, too.
+            # Locks hold descriptors of the segment, too.
             and not os.path.samestat(os.fstat(fd), segment)
             and not _is_only_read(fd)
         ]
         threads = [path for path in _THREADS.iterdir() if path.name != str(os.getpid())]
-        return found + [
-            f"it has the thread {(path / 'comm').read_text().strip()}" for path in threads
+        return resources + [
+            f"it runs the thread {(path / 'comm').read_text().strip()}" for path in threads
         ]
 
 
 def _open_files() -> dict[int, str]:
-    """Return the open files of this process, with what each is."""
-    found = {}
+    """Return the open files of this process with their names."""
+    name_by_descriptor = {}
     for entry in [*_DESCRIPTORS.iterdir()]:
-        # That of the listing itself is gone.
+        # The descriptor of the listing itself is closed by now.
         with suppress(FileNotFoundError):
-            found[int(entry.name)] = str(entry.readlink())
-    return found
+            name_by_descriptor[int(entry.name)] = str(entry.readlink())
+    return name_by_descriptor
 
 
 def _is_only_read(fd: int) -> bool:
-    """Say whether an open file is a regular file or a folder that is only read, or a device."""
+    """Check whether an open file is a device, or a file or folder open only for reading."""
     kind = os.fstat(fd).st_mode
     has_content = stat.S_ISREG(kind) or stat.S_ISDIR(kind)
     flags = fcntl(fd, F_GETFL)

@@ -1,4 +1,4 @@
-"""A task's ports on the bus: the readers and writers of its mailboxes, used once per cycle."""
+"""Ports of a task on the bus: the readers and writers of its mailboxes, used once per cycle."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from rack.backplane.watch.watched_reader import GridReader, watched
 from rack.boards.exchange import Taken
 from rack.boards.faults.kind import kind_of
 from rack.boards.faults.message_steps import FaultyWriter
+from rack.boards.run.compiled_mailbox import MOST_PORTS
 from rack.boards.run.port_tables import Line, ReadTable, WriteTable, can_write
 from rack.boards.wiring import Source
 from rack.levels.level import LevelSection, Reading, Verdict
@@ -26,9 +27,13 @@ from rack.levels.ports import Sender
 
 
 class InputPorts:
-    """The mailboxes that a task reads, watched; the level holds the last `Reading` of each port.
+    """The mailboxes that a task reads and watches. The level gets the last `Reading` of each port.
 
-    `readers` holds the reader of each mailbox, `taken` every mailbox in the order of the ports.
+    Attributes:
+        task: State of the reading task.
+        readers: Reader of each mailbox.
+        taken: Every mailbox, in the order of the ports.
+        reads_plan: True if the task reads a plan.
     """
 
     def __init__(
@@ -45,19 +50,19 @@ class InputPorts:
         """Open the mailboxes.
 
         Args:
-            segment: The rack's memory.
-            level: The level that reads; it says how many messages to take from a queue.
-            sources: The mailboxes by port.
-            alarms: Where faults of messages are reported.
-            plan: The mailbox that holds the task's own plan.
-            exchange: The ports that are not simply read in every cycle.
-            inbox: The inbox of the task's board.
+            segment: Memory of the rack.
+            level: The level that reads. It decides how many messages to take from a queue.
+            sources: Mailboxes by port.
+            alarms: Ring for alarms about faults of messages.
+            plan: Mailbox with the plan of the task's level.
+            exchange: Ports that are not simply read in every cycle.
+            inbox: Inbox of the task's board.
         """
         self.task = ReadingTask(inbox)
         self.taken: list[Taken] = []
         self.readers: dict[str, Reader] = {}
-        # Where each reading goes: the ports themselves, or the dict of a port that reads many
-        # mailboxes.
+        # Readings go to the ports themselves or, for a port that reads several mailboxes, to its
+        # dictionary.
         plans: list[Line] = []
         self._rest: list[Line] = []
         for port, source in sources.items():
@@ -65,39 +70,52 @@ class InputPorts:
             values = level.input_table(port)
             if not isinstance(source, str):
                 values[port] = values = {}
-            how = (exchange or {}).get(port)
+            rule = (exchange or {}).get(port)
             open_port = partial(
                 watched, segment, alarms=alarms, task=self.task, room=partial(level.room, port)
             )
             for key, mailbox in boxes.items():
                 if port in level.inputs:
                     segment.message_classes[mailbox] = level.inputs[port].message
-                found = open_port(mailbox, asynchronous=how is not None and how.asynchronous)
-                read = found.read if how is None else GridReader(found, how.grid).read
-                values[key] = Reading(found.reader.message, Verdict.NONE)
-                line = Line(values, key, read, found)
+                watched_reader = open_port(
+                    mailbox, asynchronous=rule is not None and rule.asynchronous
+                )
+                read = (
+                    watched_reader.read
+                    if rule is None
+                    else GridReader(watched_reader, rule.grid).read
+                )
+                """Read every mailbox as of `tick`."""
+                values[key] = Reading(watched_reader.reader.message, Verdict.NONE)
+                line = Line(values, key, read, watched_reader)
                 (plans if mailbox == plan else self._rest).append(line)
-                self.taken.append(Taken(values, key, found.reader))
-                self.readers[mailbox] = found.reader
+                self.taken.append(Taken(values, key, watched_reader.reader))
+                self.readers[mailbox] = watched_reader.reader
         self.reads_plan = bool(plans)
         self._plan_table = ReadTable(plans)
         self._table = ReadTable(self._rest)
         self._readers = [entry.reader for entry in self.taken]
 
     def follow(self, segment: Segment, queue: QueueWriter, alarms: AlarmWriter) -> None:
-        """Read the position of the reader of a queue that the task writes, with the mailboxes of
-        its ports.
+        """Read the position of the reader of a queue that the task writes.
+
+        It is read together with the mailboxes of the ports.
+
+        Args:
+            segment: Memory of the rack.
+            queue: Writer of the queue.
+            alarms: Ring for alarms about faults of messages.
         """
-        found = watched(segment, taken_name(queue.spec.name), alarms, self.task)
+        position_reader = watched(segment, taken_name(queue.spec.name), alarms, self.task)
 
         def read_and_note(tick: int) -> Reading[AnyMessage]:
-            reading = found.read(tick)
+            reading = position_reader.read(tick)
             queue.taken = reading.message.taken
             return reading
 
-        self._rest.append(Line({}, "", read_and_note, found))
+        self._rest.append(Line({}, "", read_and_note, position_reader))
         self._table = ReadTable(self._rest)
-        self._readers.append(found.reader)
+        self._readers.append(position_reader.reader)
 
     def read(self, tick: int) -> None:
         """Read every mailbox as of `tick`."""
@@ -110,7 +128,10 @@ class InputPorts:
         self._plan_table.read(tick)
 
     def read_command_and_status(self, tick: int) -> None:
-        """Read every other mailbox as of `tick`: commands, statuses, world model."""
+        """Read every mailbox except the plan as of `tick`.
+
+        These are commands, statuses and the world model.
+        """
         self._table.read(tick)
 
     @property
@@ -125,7 +146,7 @@ class InputPorts:
 
     @property
     def traffic(self) -> tuple[int, int]:
-        """Number of accesses and of bytes read so far."""
+        """Number of accesses and number of bytes read."""
         accesses = sum(reader.accesses for reader in self._readers)
         return accesses, sum(reader.transfers * reader.spec.size for reader in self._readers)
 
@@ -133,11 +154,10 @@ class InputPorts:
 class OutputPort:
     """One mailbox that a task writes.
 
-    It rests on the messages of `sources`: its basis is the oldest of theirs.
-
-    A level sends the messages of a queue itself, unless it does not (`sends`): its message is then
-    sent in every cycle in which it is written. A mailbox with a `max_age` is written on demand, in
-    the cycles in which the level has sent a message.
+    The basis of its message is the oldest basis of the messages of `sources`. A level sends the
+    messages of a queue itself if `sends` is true. Otherwise its message is sent in every cycle in
+    which it is written. A mailbox with a `max_age` is written on demand, in the cycles in which the
+    level has sent a message.
     """
 
     def __init__(
@@ -157,28 +177,29 @@ class OutputPort:
         self._is_queue = isinstance(writer, QueueWriter)
         self._sends_itself = self._is_queue and not sends
         self.value: AnyMessage | Sender[AnyMessage] = writer.message
-        """What the level finds in its port."""
+        """Object that the level gets in its port: the message, or a `Sender`."""
         if self._is_on_demand:
             self.value = Sender(writer.message, self._send, lambda: 1)
         elif isinstance(writer, QueueWriter) and sends:
             self.value = Sender(writer.message, writer.send, writer.room)
         # A message that is not written in every cycle becomes visible at multiples of its period,
-        # from its phase.
+        # counted from its phase.
         self._ahead = spec.ahead - spec.phase
-        self._every = spec.every
         self._index = segment.layout.index(spec.name)
         self._episodes = Episodes(segment, spec.name, alarms)
         self._faulty: FaultyWriter | None = None
         self._held_up = self._refused = 0
 
     def _send(self, basis: int | None = None) -> bool:
+        """Mark the message of a port on demand to be written in this cycle."""
         self._is_sent = True
         self._basis = basis
         return True
 
     def apply(self, faults: Sequence[FaultEntry]) -> None:
-        """Apply those of these faults that concern the mailbox; messages delayed by earlier ones go
-        out with the next write.
+        """Apply the faults that concern the mailbox.
+
+        Messages delayed by earlier faults are published with the next write.
         """
         chosen = [
             entry
@@ -193,16 +214,16 @@ class OutputPort:
 
     @property
     def is_faulty(self) -> bool:
-        """Whether faults act on it, or have delayed messages."""
+        """True if faults act on the mailbox or have delayed messages."""
         return self._faulty is not None
 
     def write(self, tick: int, now: int | None) -> bool:
-        """Write the message if that is due; return False if it was too late."""
+        """Write the message if it is due. Returns False if it was too late."""
         writer = self.writer
         if self._faulty is not None and self._faulty.is_over:
             self._faulty = None
         in_time = True
-        if (tick + self._ahead) % self._every or not self._is_sent:
+        if (tick + self._ahead) % writer.spec.every or not self._is_sent:
             self.flush(tick, now)
         else:
             basis = min([source.basis for source in self.sources if source.serial], default=tick)
@@ -222,7 +243,7 @@ class OutputPort:
             self._faulty.flush(tick, now)
 
     def report(self, tick: int) -> None:
-        """Raise an alarm for the writer's findings in its own mailbox."""
+        """Raise alarms for an intruder, refused messages or a held lock."""
         writer = self.writer
         if writer.refused != self._refused:
             refused = writer.refused - self._refused
@@ -237,11 +258,11 @@ class OutputPort:
 
 
 class OutputPorts:
-    """The mailboxes that a task writes; the level holds the outgoing message of each port.
+    """The mailboxes that a task writes. The level gets the outgoing message of each port.
 
-    Each message carries the tick of the information that it rests on: a command the tick of the
-    command above, a status the tick of the status below, see `Output.rests_on`. From these ticks
-    the system's response time is measured.
+    Each message carries the tick of the information on which it depends: a command the tick of the
+    command above, a status the tick of the status below (see `Output.rests_on`). The response time
+    of the system is measured from these ticks.
     """
 
     def __init__(
@@ -256,12 +277,12 @@ class OutputPorts:
         """Open the mailboxes.
 
         Args:
-            segment: The rack's memory.
+            segment: Memory of the rack.
             level: The level that writes.
-            mailboxes: The mailboxes by port.
-            alarms: Where faults of mailboxes are reported.
-            inputs: What the task reads.
-            sent: The ports whose messages the level sends itself.
+            mailboxes: Mailboxes by port.
+            alarms: Ring for alarms about faults of mailboxes.
+            inputs: Input ports of the task.
+            sent: Ports whose messages the level sends itself.
         """
         segment.message_classes |= {
             name: level.outputs[port].message
@@ -277,13 +298,13 @@ class OutputPorts:
             level.place_output(port, output.value)
             if isinstance(writer, QueueWriter):
                 inputs.follow(segment, writer, alarms)
-        self._compiled = [port for port in self._ports if can_write(port.writer)]
+        self._compiled = [port for port in self._ports if can_write(port.writer)][:MOST_PORTS]
         self._table = WriteTable([(port.writer, port.sources) for port in self._compiled])
         self._others = [port for port in self._ports if port not in self._compiled]
         self._is_faulty = False
 
     def apply(self, faults: Sequence[FaultEntry]) -> None:
-        """Apply these faults from now on."""
+        """Apply these faults from now on, and no others."""
         for port in self._ports:
             port.apply(faults)
         self._is_faulty = any(port.is_faulty for port in self._ports)
@@ -294,9 +315,14 @@ class OutputPorts:
         return sum(writer.bus_errors for writer in self.writers.values())
 
     def write(self, tick: int, now: int | None) -> bool:
-        """Write every mailbox that is due at `tick`; return False if a message was too late.
+        """Write every mailbox that is due at `tick`.
 
-        `now`: the clock's tick, if the cycle's end may have passed.
+        Args:
+            tick: Release tick of the cycle.
+            now: Current tick. None if the end of the cycle has not come.
+
+        Returns:
+            False if a message was too late.
         """
         ports = self._ports
         if now is None and not self._is_faulty:
@@ -313,12 +339,12 @@ class OutputPorts:
         return in_time
 
     def flush(self, tick: int, now: int | None) -> None:
-        """Publish delayed messages that are due, in a cycle that writes nothing."""
+        """Publish delayed messages that are due, in a cycle that writes nothing else."""
         for port in self._ports:
             port.flush(tick, now)
 
     @property
     def traffic(self) -> tuple[int, int]:
-        """Number of messages and of bytes written so far, by former processes of the task too."""
+        """Number of messages and of bytes written, including earlier processes of the task."""
         writers = self.writers.values()
         return sum(w.serial for w in writers), sum(w.serial * w.spec.size for w in writers)

@@ -1,7 +1,8 @@
-"""Other settings for a level that goes on from a snapshot: it keeps all that has happened to it.
+"""New settings for a level that continues from a snapshot and keeps its state.
 
-A level of its class is built with the settings that it has, and one with those that it gets. What
-differs between the two, it takes over, unless it has changed that itself since it was built.
+Two levels of the same class are built, one with the old settings and one with the new ones. The
+live level takes over the attributes in which they differ, except those that it has changed itself
+since it was built.
 """
 
 from __future__ import annotations
@@ -16,13 +17,16 @@ from pydantic import BaseModel
 from rack.levels.level import Executor, LevelContext, Planner
 
 _WHOLE = (BaseModel, LevelContext, ModuleType, memoryview, type)
-"""Values that are replaced as a whole, or not at all."""
+"""Classes of values that are replaced as a whole, or not at all."""
 _NUMBERS = "biufc"
-"""Kinds of numpy's arrays whose elements are compared one by one."""
+"""Kinds of numpy arrays whose elements are compared one by one."""
 
 
 def change_settings(level: Executor | Planner, context: LevelContext) -> None:
-    """Let a level go on with another context. Raises what its constructor raises."""
+    """Give a level another context.
+
+    Raises any exception of the level's constructor.
+    """
     before, after = type(level)(level.context), type(level)(context)
     try:
         _Change().apply(level, before, after)
@@ -33,28 +37,28 @@ def change_settings(level: Executor | Planner, context: LevelContext) -> None:
 
 
 class _Change:
-    """What differs between two objects, for a third one of their class."""
+    """Differences between two objects, to be applied to a third object of their class."""
 
     def __init__(self) -> None:
         self._seen: set[int] = set()
 
     def apply(self, live: object, before: object, after: object) -> None:
-        """Change the attributes of `live`."""
+        """Apply the differences between `before` and `after` to `live`."""
         if id(live) in self._seen:
             return
         self._seen.add(id(live))
         for name in attribute_names(before):
             if hasattr(live, name) and hasattr(after, name):
                 now = getattr(live, name)
-                wanted = self._merged(now, getattr(before, name), getattr(after, name))
-                if wanted is not now:
-                    # Frozen records, too.
-                    object.__setattr__(live, name, wanted)
+                changed = self._merged(now, getattr(before, name), getattr(after, name))
+                if changed is not now:
+                    # This works for frozen dataclasses, too.
+                    object.__setattr__(live, name, changed)
 
     def _merged(self, now: Any, old: Any, new: Any) -> Any:
-        """Return a value after the change from `old` to `new`; objects are changed in place."""
+        """Return a value after the change from `old` to `new`. Objects are changed in place."""
         if not type(now) is type(old) is type(new):
-            # None, perhaps, that has become an object.
+            # For example, None has become an object.
             return new if type(now) is type(old) and now == old else now
         match now:
             case np.ndarray():
@@ -74,13 +78,13 @@ class _Change:
 
 
 def has_attributes(thing: object) -> bool:
-    """Say whether an object has attributes in Python, and is no function, class or config."""
+    """Check whether an object has Python attributes and is not a function, class or config."""
     is_whole = callable(thing) or isinstance(thing, _WHOLE)
     return not is_whole and (hasattr(thing, "__dict__") or hasattr(type(thing), "__slots__"))
 
 
 def attribute_names(thing: object) -> Iterable[str]:
-    """Return the names of an object's attributes, those in slots too."""
+    """Return the names of an object's attributes, including slots."""
     slots = [getattr(kind, "__slots__", ()) for kind in type(thing).__mro__]
-    names = [name for found in slots for name in found if hasattr(thing, name)]
+    names = [name for slot_names in slots for name in slot_names if hasattr(thing, name)]
     return [*getattr(thing, "__dict__", ()), *names]

@@ -1,8 +1,8 @@
-"""Snapshots of a rack in lockstep: between two ticks, when every task has finished, each task and
-the clock fork a copy of themselves, and the clock copies the segment.
+"""Snapshots of a rack in lockstep, taken between two ticks when every task has finished.
 
-The tasks fork at the same time, each on its core. A snapshot that falls into the outage of a board
-is taken once the board is back: a process that is not there cannot be copied.
+Each task and the clock fork a copy of themselves, and the clock copies the segment. The tasks fork
+at the same time, each on its core. A snapshot that falls into the outage of a board is taken once
+the board is back, because a missing process cannot be copied.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from rack.boards.run.task import Task
 from rack.levels.level import Executor, Planner
 
 FIRST_COST_S = 0.03
-"""About the standstill for a snapshot, before one is taken."""
+"""Assumed standstill for a snapshot before the first one is taken."""
 REFUSED = -1
 """Value of `Block.COPY` of a task that cannot be copied."""
 
 
 def takes_snapshots(segment: Segment) -> bool:
-    """Return whether the rack wants any."""
+    """Check whether the rack wants snapshots."""
     words = segment.words
     return any(
         words[word] for word in (System.SNAPSHOT_PART, System.SNAPSHOT_EVERY, System.SNAPSHOT_AT)
@@ -38,7 +38,7 @@ def takes_snapshots(segment: Segment) -> bool:
 
 
 class TaskCopies:
-    """Forks a copy of one task, between two of its cycles, when the clock wants it."""
+    """Forks a copy of one task between two of its cycles, when the clock wants it."""
 
     def __init__(
         self, task: Task, level: Executor | Planner, copier: Copier, attention: int
@@ -51,7 +51,7 @@ class TaskCopies:
         self._view = AttributeView(level)
 
     def __call__(self) -> None:
-        """Fork it, and go on; in the copy, go on when a rack does."""
+        """Fork a copy and continue. The copy continues when a rack continues from it."""
         block = self._block
         try:
             request = self._copier.copy(block[Block.COPY] - 1, show=self._view.show)
@@ -71,10 +71,14 @@ class TaskCopies:
 
 
 class ClockCopies:
-    """Takes the snapshots of a rack, so that the standstill for them is one part in
-    `System.SNAPSHOT_PART` of lockstep's time; and one before the tick in `System.SNAPSHOT_AT`.
+    """Takes the snapshots of a rack.
 
-    `cost_s`: the standstill for the last one.
+    The standstill for them is kept to 1 / `System.SNAPSHOT_PART` of lockstep's time. Additional
+    snapshots are taken every `System.SNAPSHOT_EVERY` ticks and before the tick in
+    `System.SNAPSHOT_AT`.
+
+    Attributes:
+        cost_s: Standstill for the last snapshot.
     """
 
     def __init__(self, segment: Segment, driver: LockstepDriver, copier: Copier) -> None:
@@ -86,27 +90,31 @@ class ClockCopies:
         self._taken_at = -sys.maxsize
 
     def __call__(self, tick: int) -> int:
-        """Take a snapshot before `tick`, if one is due and every process is there; return the next
-        tick before which one is.
+        """Take a snapshot before `tick`, if one is due and every process is present.
+
+        Returns:
+            The next tick before which a snapshot is due.
         """
         words = self._segment.words
-        wanted = words[System.SNAPSHOT_AT] - 1
+        requested_tick = words[System.SNAPSHOT_AT] - 1
         part, every = words[System.SNAPSHOT_PART], words[System.SNAPSHOT_EVERY]
         is_due = (every > 0 and tick >= self._taken_at + every) or (
             part > 0 and time.monotonic() >= self._not_before_s
         )
-        if tick == wanted or is_due:
+        if tick == requested_tick or is_due:
             tasks = self._driver.tasks
             self._driver.settle()
             are_there = [task.is_settled() and not task.is_lost | task.is_stopped for task in tasks]
             if all(are_there) and self._take(tick):
-                # What the rack wants that goes on from here.
+                # This is the copy. Apply the snapshot policy of the rack that continues from it.
                 return self(tick)
-        ahead = wanted if wanted > tick else sys.maxsize
-        return min(ahead, max(self._taken_at + every, tick + 1)) if every else ahead
+        next_requested = requested_tick if requested_tick > tick else sys.maxsize
+        return (
+            min(next_requested, max(self._taken_at + every, tick + 1)) if every else next_requested
+        )
 
     def _take(self, tick: int) -> bool:
-        """Take a snapshot; return whether this is a copy in it that goes on."""
+        """Take a snapshot. Returns True in a copy of the clock that continues from it."""
         started_s = time.monotonic()
         tasks = self._driver.tasks
         for task in tasks:
@@ -115,7 +123,7 @@ class ClockCopies:
         for task in tasks:
             self._driver.await_state(task, partial(_is_copied, task.block))
         if any(task.block[Block.COPY] for task in tasks):
-            # One refuses, and will.
+            # A task that refuses a copy will refuse again.
             for task in tasks:
                 task.block[Block.COPY] = 0
             self._not_before_s = float("inf")
@@ -141,4 +149,5 @@ class ClockCopies:
 
 
 def _is_copied(block: memoryview) -> bool:
+    """Check whether a task has forked its copy or refused to."""
     return block[Block.COPY] <= 0

@@ -1,7 +1,6 @@
-"""The stopwatch of a task: times and traces each cycle, and keeps the counts in the task's control
-block.
+"""Stopwatch of a task: times and traces each cycle, and updates the task's control block.
 
-It holds all bookkeeping around the paper's procedure: time stamps (R, X, W, C of eqs. 3.5 and 3.9),
+It does all bookkeeping around the paper's procedure: time stamps (R, X, W, C of eqs. 3.5 and 3.9),
 the trace record, missed deadlines, skipped releases, failed accesses, and the report to the clock
 that a release is done.
 """
@@ -26,10 +25,10 @@ BUS_COUNT_CYCLES = 64
 
 
 class Stopwatch:
-    """Times one task: a cycle calls `start`, stamps the end of each part, and calls `finish` or
-    `idle`.
+    """Times one task.
 
-    Stamps are of CLOCK_MONOTONIC.
+    A cycle calls `start_cycle`, stamps the end of each part, and calls `finish_cycle` or
+    `finish_idle_cycle`. Stamps are times of CLOCK_MONOTONIC.
     """
 
     def __init__(
@@ -42,7 +41,7 @@ class Stopwatch:
         self._outputs = outputs
         self._traffic = inputs.traffic + outputs.traffic
         self._reading = inputs.task
-        # In which byte of its status a level holds its state; always 0 without a status.
+        # Byte of the level's status that contains its state. A level without a status has state 0.
         self._status = memoryview(bytes(1))
         self._state_at = 0
         if (writer := outputs.writers.get("status")) is not None:
@@ -60,8 +59,8 @@ class Stopwatch:
         self._period_ns = self._clock.period_ns
         self._tick = self._skipped = 0
         self._late_ns = self._period_ns // 2
-        self._release_ns = 0  # grid point of the tick; in lockstep the start
-        # the cycle began more than half a tick late, or after skipped ones, or is the first
+        self._release_ns = 0  # grid point of the tick, in lockstep the start of the cycle
+        # The cycle began more than half a tick late or after skipped ones, or it is the first.
         self.is_late = True
         self.start_ns = 0  # start of the cycle
         self.plan_ns = 0  # the plan has been transferred over the bus (C of fig. 4)
@@ -70,7 +69,7 @@ class Stopwatch:
         self.end_ns = 0  # every output is written (W, U)
 
     def begin(self) -> None:
-        """Count processor time from here on."""
+        """Start to count processor time."""
         self._processor_ns = thread_time_ns()
 
     def start(self, tick: int, skipped: int) -> None:
@@ -84,8 +83,9 @@ class Stopwatch:
         self.is_late = skipped > 0 or start_ns - release_ns > self._late_ns or not self._closed_ns
 
     def now(self, deadline: int) -> int | None:
-        """Return the clock's tick once the level has processed; None while tick `deadline` has not
-        come.
+        """Return the clock's tick at the end of the level's `process`.
+
+        The result is None if tick `deadline` has not come.
         """
         if self._lockstep_done is None and self.process_ns < self._time_of(deadline):
             return None
@@ -93,9 +93,13 @@ class Stopwatch:
         return now if now >= deadline else None
 
     def finish(self, in_time: bool, deadline: int, done: int, flags: int = 0) -> None:
-        """Close the cycle: trace it, count it, and report all releases up to tick `done` as done.
+        """Close the cycle: trace it, count it, and report releases as done.
 
-        `in_time`: no message was too late. `deadline` is a tick.
+        Args:
+            in_time: False if a message was too late.
+            deadline: Tick before which the cycle had to end.
+            done: Newest release that is done.
+            flags: Flags of the trace record.
         """
         block = self._block
         tick = self._tick
@@ -114,9 +118,9 @@ class Stopwatch:
         if state != self._state:
             self._state = block[Block.LEVEL_STATE] = state
             block[Block.LEVEL_SINCE] = tick
-        used = thread_time_ns()
-        before = self._processor_ns
-        self._processor_ns = used
+        used_ns = thread_time_ns()
+        used_before_ns = self._processor_ns
+        self._processor_ns = used_ns
         self._trace.write(
             tick,
             self._release_ns,
@@ -127,23 +131,24 @@ class Stopwatch:
             self.end_ns,
             flags,
             state,
-            used - before,
+            used_ns - used_before_ns,
             self._closed_ns,
         )
         self._cycles = block[Block.CYCLES] = self._cycles + 1
         block[Block.DONE] = done
         if lockstep_done is not None and done >= block[Block.RELEASED]:
-            # The last one of a batch.
+            # This was the last release of a batch.
             lockstep_done.release()
         if not self._cycles % BUS_COUNT_CYCLES:
             self.count_bus()
         self._closed_ns = monotonic_ns()
 
     def _time_of(self, tick: int) -> int:
+        """Return the time of a tick, in ns of CLOCK_MONOTONIC."""
         return self._release_ns + (tick - self._tick) * self._period_ns
 
     def idle(self) -> None:
-        """Close a cycle in which a planner had nothing to plan: count it, but do not trace it."""
+        """Close a cycle in which a planner had nothing to plan. It is counted but not traced."""
         # Exclude its processor time from the next plan's record.
         self._processor_ns = thread_time_ns()
         self._cycles = self._block[Block.CYCLES] = self._cycles + 1
@@ -151,12 +156,12 @@ class Stopwatch:
         self.notify_clock()
 
     def notify_clock(self) -> None:
-        """In lockstep, let the clock check this task again."""
+        """In lockstep, make the clock check this task again."""
         if self._lockstep_done is not None:
             self._lockstep_done.release()
 
     def _count_troubles(self) -> int:
-        """Count failed accesses since the last cycle; return trace flags."""
+        """Count failed accesses since the last cycle, and return trace flags."""
         self._troubles = self._reading.troubles
         bus_errors = self._inputs.bus_errors + self._outputs.bus_errors
         corrupt = self._inputs.corrupt
@@ -169,8 +174,9 @@ class Stopwatch:
         return (new_errors > 0) * _BUS_ERROR | (new_corrupt > 0) * _DAMAGED
 
     def count_bus(self) -> None:
-        """Update the bus counters of the control block; doing so in every cycle would cost too
-        much.
+        """Update the bus counters of the control block.
+
+        An update in every cycle would cost too much.
         """
         before = self._traffic
         self._traffic = self._inputs.traffic + self._outputs.traffic

@@ -35,16 +35,21 @@ from rack.boards.wiring import ClockWiring
 from rack.levels.operator import DRIVES, SETTINGS, Answer
 
 HEAD_START_NS = 20_000_000
-"""Time from the start of the clock's board to tick 0, so that its start-up does not delay a
-tick."""
+"""Time from the start of the clock's board to tick 0.
+
+It keeps the board's start-up from delaying a tick.
+"""
 SILENT_NS = 1_000_000_000
-"""Real time, at the clock's own speed, after which an operator within a lease is gone that was not
-heard."""
+"""Time after which an operator under a lease that was not heard counts as gone.
+
+It is measured in real time, at the clock's speed.
+"""
 
 
 class SystemController:
-    """The clock's duties at every tick besides releasing tasks; see
-    `rack.backplane.clock.driver.Controller`.
+    """The clock's duties at every tick besides releasing tasks.
+
+    See `rack.backplane.clock.driver.Controller`.
     """
 
     def __init__(
@@ -60,7 +65,7 @@ class SystemController:
         self._demand = as_named(Demand, self._words[System.DEMAND])
 
     def begin(self, tick: int) -> None:
-        """Do the work due before the tasks of `tick` are released."""
+        """Do the work that is due before the tasks of `tick` are released."""
         words = self._words
         faults = self._faults
         desk = self._desk
@@ -77,20 +82,20 @@ class SystemController:
             self._handle_losses(tick)
 
     def released(self, tick: int) -> None:
-        """Do the work due after the release."""
+        """Do the work that is due after the release."""
         self._faults.within(tick)
 
     def rests_until(self, tick: int) -> int:
-        """Return the first tick after `tick` that needs `begin`, or may end the run, as far as is
-        known.
-        """
+        """Return the first tick after `tick` that needs `begin_tick` or may end the run."""
         if self._settled is None:
             return tick + 1
         return min(self._faults.next_tick, self._desk.next_tick, self._end_of_run.next_tick)
 
     def _handle_losses(self, tick: int) -> None:
-        """Let restarted boards rejoin, latch for those given up, and set the demand for all other
-        losses.
+        """Handle all lost boards.
+
+        Restarted boards rejoin. A board that was given up latches the emergency stop. The other
+        losses determine the demand on the arm.
         """
         words = self._words
         seen = words[System.LOSSES], self._driver.watchdog.losses
@@ -99,7 +104,7 @@ class SystemController:
             if task.is_lost:
                 self._handle_loss(task, tick)
         lost = [task for task in processes if task.is_lost]
-        # Read before they are acted on: a change in between is handled at the next tick.
+        # Read these words before acting on them. A later change is handled at the next tick.
         emergency = words[System.EMERGENCY_STOP]
         peer = words[System.PEER_STOP]
         asked = [
@@ -115,11 +120,12 @@ class SystemController:
             self._demand = demand
             words[System.DEMAND] = demand
             self._driver.alarms.ring(tick, Alarm.DEMAND, subject, demand)
-        # The same holds for a switch that lies ahead, and for a loss that the crate is recording.
+        # A switch in the future, or a loss that the crate is recording, must be looked at again.
         is_settled = not lost and peer >> 1 <= tick and seen[0] % 2 == 0
         self._settled = (*seen, emergency, peer) if is_settled else None
 
     def _handle_loss(self, task: ReleasedTask, tick: int) -> None:
+        """Let a restarted board rejoin, or react to a board that was given up."""
         lockstep = self._wiring.lockstep
         if lockstep and tick < task.lost_tick + self._wiring.restart_ticks:
             return
@@ -130,23 +136,22 @@ class SystemController:
             task.rejoin()
             self._driver.alarms.ring(tick, Alarm.REJOINED, task.index, away)
         elif task.is_given_up and task.spec.role == "host":
-            # From this tick on its adapter reports that.
+            # From this tick on the adapter of the host board reports the loss.
             self._driver.settle()
             task.rejoin()
         elif task.is_given_up:
-            # Even if the latch is already set, as it is before the start.
+            # Do this even if the latch is already set, as it is before the start.
             self._words[System.EMERGENCY_STOP] = 1
-            # Time for the arm to come to rest before the run ends.
+            # Leave the arm time to come to rest before the run ends.
             ends = tick + self._wiring.linger
             self._words[System.STOP_TICK] = min(self._words[System.STOP_TICK] or ends, ends)
 
 
 class OperatorDesk:
-    """Issues operator commands at the start of a tick, each into its level's mailbox, before any
-    task is released.
+    """Issues operator commands at the start of a tick, before any task is released.
 
-    There is nothing to do before `next_tick` unless more than the first `requested` commands have
-    come.
+    Each command goes into its level's mailbox. Nothing is due before `next_tick` unless more than
+    the first `requested` commands have come.
     """
 
     def __init__(self, segment: Segment, alarms: AlarmWriter) -> None:
@@ -161,17 +166,19 @@ class OperatorDesk:
             if box.writer == CLOCK
         }
         statuses = {at: f"{self._boxes[at].name.partition('.')[0]}.status" for at in self._writers}
-        there = {box.name for box in self._boxes if "order" in {field.name for field in box.fields}}
+        answering = {
+            box.name for box in self._boxes if "order" in {field.name for field in box.fields}
+        }
         self._statuses = {
-            at: open_observer(segment, name) for at, name in statuses.items() if name in there
+            at: open_observer(segment, name) for at, name in statuses.items() if name in answering
         }
         self.requested = -1
         self.next_tick = 0
         self._waiting: list[RequestEntry] = []
         self._leased: list[RequestEntry] = []
         self._newest: dict[int, int] = {}
-        """Of each mailbox, the serial of the newest command that takes the place of others."""
-        # A tick of lockstep has no length.
+        """Serial of the newest command that replaces earlier ones, by mailbox."""
+        # A tick of lockstep has no length in real time.
         in_time = not self._words[System.LOCKSTEP]
         self._silent = SILENT_NS // segment.layout.clock_ns if in_time else sys.maxsize
 
@@ -185,8 +192,8 @@ class OperatorDesk:
             self._check_lease(entry, tick)
         for entry in [entry for entry in self._waiting if entry.tick <= tick]:
             self._waiting.remove(entry)
-            # Mark first, then check that it still waits; a client that withdraws it uses the
-            # opposite order.
+            # First mark the request, then check that it is still waiting. A client that withdraws
+            # it uses the opposite order.
             entry.given_tick = tick
             if self._table.is_waiting(entry):
                 self._give(entry, tick)
@@ -196,9 +203,10 @@ class OperatorDesk:
         self.next_tick = min(due, default=sys.maxsize)
 
     def _give(self, entry: RequestEntry, tick: int) -> None:
+        """Issue the command of a waiting request."""
         writer = self._writers[entry.mailbox]
         if not entry.serial:
-            # If the clock dies after this line, its successor issues the command again, under the
+            # If the clock dies after this line, its successor issues the command again with the
             # same serial.
             self._words[System.COMMANDED] += 1
             entry.serial = self._words[System.COMMANDED]
@@ -214,7 +222,7 @@ class OperatorDesk:
             self._leased.append(entry)
 
     def _check_lease(self, entry: RequestEntry, tick: int) -> None:
-        """Have a level hold whose operator has gone while the command is in force."""
+        """Make a level hold if its operator has gone while the command is in force."""
         mailbox = entry.mailbox
         if self._is_over(entry):
             self._table.release(entry)
@@ -222,7 +230,7 @@ class OperatorDesk:
             heard = max(entry.given_tick, entry.heard)
             if self._table.client_lives(entry) and tick - heard <= self._silent:
                 return
-            # At once, without a request: there may be no room for one.
+            # Issue the hold at once, without a request, because the table may be full.
             writer = self._writers[mailbox]
             self._words[System.COMMANDED] += 1
             writer.message.raw[:] = hold(self._boxes[mailbox]).raw
@@ -233,9 +241,7 @@ class OperatorDesk:
         self._leased.remove(entry)
 
     def _is_over(self, entry: RequestEntry) -> bool:
-        """Return whether the level has refused the command, or accepted a newer one in its
-        place.
-        """
+        """Check whether the level has refused the command or accepted a newer one instead."""
         mailbox = entry.mailbox
         serial = entry.serial
         newest = self._newest.get(mailbox, 0)
@@ -252,10 +258,10 @@ class OperatorDesk:
 
 
 class EndOfRun:
-    """Decides at which tick a run ends, by ticks alone.
+    """Decides the tick at which a run ends, by ticks alone.
 
-    The end of the task is noted even where the run ends at a given tick: one that continues it may
-    end with its task.
+    The end of the task is recorded even if the run ends at a given tick, because a run that
+    continues it may end with its task.
     """
 
     def __init__(self, segment: Segment, wiring: ClockWiring) -> None:
@@ -265,7 +271,7 @@ class EndOfRun:
         self._reader = open_observer(segment, wiring.ends_run) if wiring.ends_run else None
         self._silent = wiring.silent
         self._heard: int | None = None
-        # By ticks, a message becomes visible at a boundary of its writer's period.
+        # Under a protocol by ticks, messages become visible at boundaries of the writer's period.
         self._every = 1
         self._phase = 0
         if self._reader is not None:
@@ -277,14 +283,15 @@ class EndOfRun:
 
     @property
     def next_tick(self) -> int:
-        """The next tick at which the answer may be another one."""
+        """The next tick at which the decision may change."""
         if self._reader is None or self._task_ends is not None:
             return sys.maxsize
         return self._next + 1
 
     def __call__(self, tick: int) -> int | None:
-        """Return the tick at which the run stops, by the messages as of the tick before; None until
-        it is known.
+        """Return the tick at which the run stops, by the messages as of the previous tick.
+
+        The result is None until it is known.
         """
         final = tick - 1
         if final >= self._next and self._task_ends is None and self._reader is not None:
@@ -302,9 +309,13 @@ class EndOfRun:
 def run_clock(
     segment: Segment, wiring: ClockWiring, attention: int, copier: Copier | None = None
 ) -> None:
-    """Run the clock until the run is over; a restarted clock continues on the existing grid.
+    """Run the clock until the run is over. A restarted clock continues on the existing grid.
 
-    With a `copier`, take snapshots.
+    Args:
+        segment: Memory of the rack.
+        wiring: Wiring of the clock.
+        attention: eventfd that wakes the Rack.
+        copier: Forks the copies of the clock for snapshots. None to take no snapshots.
     """
     words = segment.words
     words[System.CLOCK_PID] = os.getpid()

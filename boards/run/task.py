@@ -1,6 +1,4 @@
-"""A task on its board: the common part of the executor's and the planner's loop, the clock guard of
-fast tasks, and the board's interrupt handler.
-"""
+"""A task on its board, with the clock guard of fast tasks and the board's interrupt handler."""
 
 from __future__ import annotations
 
@@ -29,7 +27,7 @@ _R = TypeVar("_R")
 
 
 class Task(ABC):
-    """One task around a level's executor or planner: ports, clock, stopwatch and faults."""
+    """A task around a level's executor or planner: ports, clock, stopwatch and faults."""
 
     def __init__(
         self,
@@ -69,9 +67,9 @@ class Task(ABC):
         self._generation = 0
 
     def wait_until_next_cycle(self) -> int | None:
-        """Wait for the next release and return its tick; None when the run is over.
+        """Wait for the next release and return its tick. Returns None if the run is over.
 
-        Between cycles, here, faults take effect.
+        Faults take effect here, between cycles.
         """
         tick = self.next_cycle.wait()
         if tick is None:
@@ -90,16 +88,18 @@ class Task(ABC):
 
     @abstractmethod
     def cycle(self, tick: int) -> None:
-        """Do the cycle released at `tick`."""
+        """Run the cycle released at `tick`."""
 
 
 class ClockGuard:
-    """A fast task's check of the clock: has it skipped ticks and, if a cycle begins late, has it
-    released it late?
+    """A fast task's check for ticks that the clock has skipped or begun late.
 
-    Most skips cost a task that does not cycle in every tick no release, and make none of its cycles
-    late: only the clock's count shows them. `reported`: how much of it this task has reported, in
-    this process or before a restart.
+    Most skips cost a task that does not cycle in every tick no release and make none of its cycles
+    late. Only the clock's count shows them.
+
+    Attributes:
+        reported: Number of skipped ticks that this task has reported, including earlier
+            processes.
     """
 
     def __init__(self, segment: Segment, alarms: AlarmWriter, block: memoryview) -> None:
@@ -115,8 +115,8 @@ class ClockGuard:
         """Report the ticks skipped since the last report, in the cycle released at `tick`."""
         words = self._words
         since = words[System.SKIPPED_FROM]
-        # A task may begin so late that the clock has skipped ticks since its release: that is for
-        # its next cycle.
+        # A task may begin so late that the clock has skipped ticks since its release. Its next
+        # cycle reports these.
         if tick >= since:
             counted = words[System.CLOCK_SKIPPED]
             self._alarms.ring(tick, Alarm.CLOCK_SKIPPED, value=counted - self.reported, since=since)
@@ -126,8 +126,8 @@ class ClockGuard:
         """Check whether the clock was late, in a cycle released at `tick` that begins late."""
         words = self._words
         late_ns = words[System.TICK_NS] - self._clock.time_of(tick)
-        # Checked after the read: the time is this tick's only if the clock has not advanced
-        # meanwhile.
+        # Check this after the read. The time belongs to this tick only if the clock has not
+        # advanced since.
         if self._clock.is_lockstep or words[System.TICK] != tick:
             return
         if late_ns > self._late_ns:
@@ -137,13 +137,13 @@ class ClockGuard:
 
 
 class InterruptHandler:
-    """The interrupt handler of a board, under protocol interrupt: charges the time of interrupts,
-    counts them, and reports those that are lost.
+    """Interrupt handler of a board, under protocol interrupt.
 
-    On the boards of the time it ran whenever a message came. Here the first task of the board does
-    its work, just before it reads: it takes as much processor time as the handler has worked since
-    the last cycle. So reading, t_comm of eq. 3.5, grows by it, and every task below on the same
-    core is kept waiting. In lockstep, where nothing waits for a processor, it takes no time.
+    It charges the time of interrupts, counts them, and reports lost ones. On the original boards it
+    ran whenever a message came. Here the first task of the board does its work just before it
+    reads, and takes as much processor time as the handler would have used since the last cycle.
+    Reading, t_comm of eq. 3.5, grows by this time, and every lower task on the same core has to
+    wait. In lockstep, where nothing waits for a processor, it takes no time.
     """
 
     def __init__(self, segment: Segment, task: str, inbox: BoardInbox, alarms: AlarmWriter) -> None:
@@ -154,7 +154,7 @@ class InterruptHandler:
         self._lines = [
             (line, Episodes(segment, name, alarms)) for name, line in inbox.lines.items()
         ]
-        # What happened before this process was there is neither charged nor counted.
+        # Interrupts before the start of this process are neither charged nor counted.
         inbox.advance(clock.tick)
         inbox.inbox.most_waiting = 0
         self._served = inbox.count
@@ -163,7 +163,7 @@ class InterruptHandler:
         self._cycles = 0
 
     def serve(self, tick: int) -> None:
-        """Serve everything that has come up to the release at `tick`."""
+        """Serve all messages that have come up to the release at `tick`."""
         inbox = self._inbox
         begun_ns = process_time_ns()
         self._cycles += 1
@@ -186,23 +186,24 @@ class InterruptHandler:
 
 
 def in_turn(*accesses: Callable[[int], None] | None) -> Callable[[int], None]:
-    """Return a function that makes these accesses one after the other, as far as there are any; one
-    alone itself.
+    """Return a function that makes these accesses one after the other, leaving out None.
+
+    A single access is returned itself.
     """
-    found = [access for access in accesses if access is not None]
+    present = [access for access in accesses if access is not None]
 
     def make_all(tick: int) -> None:
-        for access in found:
+        for access in present:
             access(tick)
 
-    return make_all if len(found) > 1 else found[0]
+    return make_all if len(present) > 1 else present[0]
 
 
 def slowed(access: Callable[_P, _R], time_ns: int) -> Callable[_P, _R]:
-    """Return `access`, extended to at least `time_ns` of processor time; `access` itself if that is
-    0.
+    """Return `access`, extended to at least `time_ns` of processor time.
 
-    This emulates a slower bus: programmed transfers over VME occupied the processor.
+    This emulates a slower bus: programmed transfers over VME occupied the processor. For 0,
+    `access` itself is returned.
     """
     if not time_ns:
         return access

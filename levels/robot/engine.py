@@ -17,7 +17,7 @@ awake. A simulation restored from this state continues bit for bit, asleep or aw
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,44 +26,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rack.levels.algebra import Array
-from rack.levels.compiled import compiled
+from rack.levels.compiled import c_function
 
 INTEGRATION = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 SLEEP = int(mujoco.mjtEnableBit.mjENBL_SLEEP)
-LIBRARY = Path(mujoco.__file__).with_name(f"libmujoco.so.{mujoco.mj_versionString()}")
+LIBRARY = str(Path(mujoco.__file__).with_name(f"libmujoco.so.{mujoco.mj_versionString()}"))
 
 
-class native(compiled[..., None]):  # noqa: N801  # used like a function
-    """A function of MuJoCo that returns nothing.
-
-    Its arguments are integers: addresses, sizes and flags.
-    """
-
-    def __init__(self, name: str, arguments: int) -> None:
-        function = getattr(ctypes.CDLL(str(LIBRARY)), name)
-        function.restype = None
-        function.argtypes = [ctypes.c_ssize_t] * arguments
-        super().__init__(function)
-        self._name = name
-        self._arguments = arguments
-
-    def load(self) -> Any:
-        """Return the function for compiled callers."""
-        if self._machine is None:
-            from llvmlite import binding
-            from numba import types
-
-            binding.load_library_permanently(str(LIBRARY))
-            self._machine = types.ExternalFunction(
-                self._name, types.void(*[types.intp] * self._arguments)
-            )
-        return self._machine
-
-    def source(self) -> Iterator[bytes]:
-        """Yield the name and the number of arguments, which determine the calling code."""
-        yield repr((self._name, self._arguments)).encode()
-
-
+native = partial(c_function, LIBRARY)
+"""A function of MuJoCo that returns nothing, by its name and its number of arguments."""
 mj_step = native("mj_step", 2)
 mj_kinematics = native("mj_kinematics", 2)
 mj_collision = native("mj_collision", 2)

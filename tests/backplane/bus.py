@@ -97,7 +97,7 @@ def task(
 def layout(
     rack: str, mailboxes: Iterable[MailboxSpec] = (), tasks: Iterable[TaskSpec] = ()
 ) -> Layout:
-    """Return a layout; without `tasks`, those of a writer and a reader."""
+    """Return a layout. By default it has a writing and a reading task."""
     return Layout(
         rack, CLOCK_NS, tuple(tasks) or (task("writer"), task("reader", slot=3)), tuple(mailboxes)
     )

@@ -1,4 +1,4 @@
-"""Buses for tests, removed at their end."""
+"""Buses for tests, removed at the end of the test."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ MakeBus = Callable[..., Segment]
 
 @pytest.fixture
 def make_bus(rack_name: str) -> Iterator[MakeBus]:
-    """Make the one bus of a test, of these mailboxes and tasks."""
+    """Return a function that creates the only bus of a test, with mailboxes and tasks."""
 
     made: list[Segment] = []
 

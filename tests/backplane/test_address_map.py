@@ -1,4 +1,4 @@
-"""The memory map: windows on pages, nothing over anything else."""
+"""Memory map: windows on pages, without overlaps."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_no_two_writers_share_a_cache_line(full: Layout) -> None:
     assert all(address + size <= following for (address, size), (following, _) in pairwise(areas))
 
 
-def test_what_a_board_writes_lies_in_its_window(full: Layout) -> None:
+def test_everything_that_a_board_writes_is_in_its_window(full: Layout) -> None:
     places = AddressMap(full)
     boxes, blocks = places.mailboxes, places.blocks
     of_writer = (boxes["writer.a"], boxes["writer.c"], blocks["writer"], blocks["writer.planner"])

@@ -1,4 +1,4 @@
-"""TOML from outside: what is parsed is TOML's own, and no text takes long to parse."""
+"""TOML from outside: parsed as by the library, and no text takes long to parse."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_a_key_of_very_many_parts_is_refused_at_once(text: str) -> None:
         "x = 1979-05-27T07:32:00.999999",
     ],
 )
-def test_what_is_no_deep_key_is_parsed_as_by_the_library(text: str) -> None:
+def test_text_without_deep_keys_is_parsed_as_by_the_library(text: str) -> None:
     assert load_toml(text) == tomllib.loads(text)
 
 

@@ -43,7 +43,7 @@ def test_a_lock_ends_with_its_process(make_bus: MakeBus) -> None:
     assert mine.take()
 
 
-def test_asking_for_a_lock_names_one_byte_and_takes_nothing(make_bus: MakeBus) -> None:
+def test_a_query_concerns_one_byte_and_takes_no_lock(make_bus: MakeBus) -> None:
     segment = make_bus()
     lock = ByteLock(segment.fd, ADDRESS)
     lock.take()

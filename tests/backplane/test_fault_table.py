@@ -1,4 +1,4 @@
-"""The fault table: any process fills whole entries, and each task finds its own."""
+"""Fault table: any process fills complete entries, and each task finds its faults."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ WHOLE = Injection(
 )
 
 
-def test_an_entry_holds_what_was_asked_for(make_bus: MakeBus) -> None:
+def test_an_entry_contains_the_injected_fault(make_bus: MakeBus) -> None:
     segment = make_bus(mailbox())
     entry = FaultTable(segment).add(WHOLE)
     read = FaultTable(segment).entries[entry.index]
@@ -40,7 +40,7 @@ def test_an_entry_holds_what_was_asked_for(make_bus: MakeBus) -> None:
     assert FaultTable(segment).add(replace(WHOLE, when=None)).when_box == -1
 
 
-def test_the_first_time_that_a_fault_acts_is_kept_and_how_long_it_was_hidden(
+def test_the_first_effect_of_a_fault_and_the_delay_to_the_first_visible_one_are_recorded(
     make_bus: MakeBus,
 ) -> None:
     entry, before = FaultTable(make_bus()).add(Injection(0, 0)), monotonic_ns()
@@ -54,7 +54,7 @@ def test_the_first_time_that_a_fault_acts_is_kept_and_how_long_it_was_hidden(
     assert entry.words[12:16].tolist() == [9, first, 2, 12 - 9]
 
 
-def test_a_full_table_refuses(make_bus: MakeBus) -> None:
+def test_a_full_table_refuses_another_fault(make_bus: MakeBus) -> None:
     table = FaultTable(make_bus())
     for _ in range(FAULT_ENTRIES):
         table.add(Injection(0, 0))
@@ -63,7 +63,7 @@ def test_a_full_table_refuses(make_bus: MakeBus) -> None:
 
 
 @pytest.mark.filterwarnings(FORKS)
-def test_two_who_inject_at_once_take_two_entries(make_bus: MakeBus) -> None:
+def test_two_concurrent_injections_take_two_entries(make_bus: MakeBus) -> None:
     segment, each = make_bus(), 15
 
     def inject(seed: int) -> None:
@@ -78,7 +78,7 @@ def test_two_who_inject_at_once_take_two_entries(make_bus: MakeBus) -> None:
     assert segment.words[System.INJECTED] == 3 * each
 
 
-def test_a_fault_that_waits_can_be_taken_back_and_one_that_has_begun_cannot(
+def test_a_waiting_fault_can_be_withdrawn_and_an_active_one_cannot(
     make_bus: MakeBus,
 ) -> None:
     table = FaultTable(make_bus(task("level")))

@@ -17,6 +17,6 @@ def test_a_number_that_is_not_finite_is_null_at_any_depth(number: float) -> None
     assert found == {"a": None, "b": [1, [None, {"c": None}]], "d": 0.5}
 
 
-def test_other_data_are_encoded_as_ever() -> None:
+def test_other_data_are_encoded_as_by_the_standard_library() -> None:
     document = {"a": [1, 2.5, None, True, "ü"], "b": {"c": ()}}
     assert encode_json(document, indent=2) == json.dumps(document, indent=2)

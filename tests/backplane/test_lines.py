@@ -1,4 +1,4 @@
-"""The utility lines: SYSFAIL by slot, and the lines that one word holds."""
+"""Utility lines: SYSFAIL by slot, and the lines of one word each."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_a_board_that_fails_holds_sysfail_again(bus: Segment) -> None:
 
 
 @pytest.mark.parametrize("line", ["acfail", "sysreset", "emergency_stop"])
-def test_each_line_has_its_own_word(bus: Segment, line: str) -> None:
+def test_each_line_has_a_separate_word(bus: Segment, line: str) -> None:
     lines, names = UtilityLines(bus), ("acfail", "sysreset", "emergency_stop")
     bus.words[getattr(System, line.upper())] = 1
     assert [name for name in names if getattr(lines, name)] == [line]

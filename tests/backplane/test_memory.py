@@ -16,7 +16,7 @@ from tests.processes import FORKS, exit_status, fork, kill
 
 PAGES = 4096
 FEW = 64
-"""Pages of a process's own bookkeeping: its stack, its allocator, the interpreter's code."""
+"""Pages used by the process itself: its stack, its allocator, the interpreter's code."""
 LARGE = 40 << 20
 """Above the largest bound, 32 MiB, to which the C library raises its own thresholds for
 mappings."""

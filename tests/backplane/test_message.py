@@ -70,11 +70,11 @@ class Colour(IntEnum):
 @pytest.mark.parametrize(
     ("name", "hint", "declared", "why"),
     [
-        ("raw", float, field(unit="1", doc=""), "permitted: annotated"),
-        ("copy_from", float, field(unit="1", doc=""), "no attribute of Message"),
-        ("_x", float, field(unit="1", doc=""), "no leading '_'"),
-        ("x", None, field(unit="1", doc=""), "permitted: annotated"),
-        ("x", float, field(doc=""), 'has no unit; of a pure number it is "1"'),
+        ("raw", float, field(unit="1", doc=""), "must be annotated"),
+        ("copy_from", float, field(unit="1", doc=""), "not named like an attribute"),
+        ("_x", float, field(unit="1", doc=""), "without leading '_'"),
+        ("x", None, field(unit="1", doc=""), "must be annotated"),
+        ("x", float, field(doc=""), 'has no unit; the unit of a pure number is "1"'),
         ("x", float, field("i4", unit="1", doc=""), "numpy type 'i4' does not hold float"),
         ("x", float, field("f99", unit="1", doc=""), "data type 'f99' not understood"),
         ("x", int, field("u1", unit="1", doc="", default=256), "default 256 does not fit"),
@@ -126,7 +126,7 @@ class Lamp(Message, version=1):
     colour: Colour = field(doc="")
 
 
-def test_flags_and_names_read_as_what_they_are() -> None:
+def test_flags_read_as_bools_and_names_as_enum_members() -> None:
     lamp = Lamp.zeros({})
     lamp.on, lamp.colour = True, Colour.BLUE
     assert (lamp.on, lamp.colour) == (True, Colour.BLUE)

@@ -1,5 +1,4 @@
-"""The operator table: requests are filled whole, wait in order, may be withdrawn, and make room
-once issued."""
+"""Operator table: requests are filled completely, wait in order and can be withdrawn."""
 
 from __future__ import annotations
 
@@ -37,7 +36,7 @@ def give(entry: RequestEntry, serial: int) -> None:
     entry.stage = RequestStage.GIVEN
 
 
-def test_an_entry_holds_what_was_asked_for(segment: Segment) -> None:
+def test_an_entry_contains_the_request(segment: Segment) -> None:
     message = bytes(range(1, 1 + segment.layout.mailbox(BOX).size % 256))
     entry = OperatorTable(segment).add(Request(0, message, tick=40))
     read = OperatorTable(segment).entries[entry.index]
@@ -46,7 +45,7 @@ def test_an_entry_holds_what_was_asked_for(segment: Segment) -> None:
     assert (read.stage, read.serial, read.given_tick) == (RequestStage.WAITING, 0, -1)
 
 
-def test_requests_wait_in_the_order_in_which_they_came(segment: Segment) -> None:
+def test_requests_wait_in_the_order_of_their_arrival(segment: Segment) -> None:
     table = OperatorTable(segment)
     added = [table.add(Request(0, b"", tick)) for tick in (9, 3, 5)]
     give(added[0], 1)
@@ -56,7 +55,7 @@ def test_requests_wait_in_the_order_in_which_they_came(segment: Segment) -> None
     assert segment.words[System.REQUESTED] == 4
 
 
-def test_of_commands_issued_those_are_lacking_that_wait_for_no_tick_until_theirs(
+def test_issued_commands_without_a_waiting_request_by_their_tick_are_missing(
     segment: Segment,
 ) -> None:
     table = OperatorTable(segment)
@@ -107,7 +106,7 @@ def test_a_claimed_request_waits_as_long_as_its_client_holds_it(segment: Segment
 
 
 @pytest.mark.filterwarnings(FORKS)
-def test_a_dead_client_makes_room(segment: Segment) -> None:
+def test_the_entry_of_a_dead_client_is_reused(segment: Segment) -> None:
     table = OperatorTable(segment)
 
     def die() -> None:
@@ -123,7 +122,7 @@ def test_a_dead_client_makes_room(segment: Segment) -> None:
     assert len(entries) == len(table.waiting()) == OPERATOR_ENTRIES
 
 
-def test_a_full_table_makes_room_with_the_command_given_longest_ago(segment: Segment) -> None:
+def test_a_full_table_reuses_the_entry_of_the_command_issued_longest_ago(segment: Segment) -> None:
     table = OperatorTable(segment)
     entries = [table.add(Request(0, b"", 9)) for _ in range(OPERATOR_ENTRIES)]
     with pytest.raises(OperatorTableError, match=f"full: {OPERATOR_ENTRIES} commands wait"):
@@ -134,7 +133,7 @@ def test_a_full_table_makes_room_with_the_command_given_longest_ago(segment: Seg
 
 
 @pytest.mark.parametrize(("tick", "was_withdrawn"), [(-1, True), (0, False), (1, False)])
-def test_a_request_that_the_clock_is_just_giving_is_not_withdrawn(
+def test_a_request_that_the_clock_is_issuing_is_not_withdrawn(
     segment: Segment, tick: int, was_withdrawn: bool
 ) -> None:
     table = OperatorTable(segment)

@@ -42,7 +42,7 @@ from tests.processes import FORKS, descriptors, exit_status, fork, forked, wait_
 pytestmark = pytest.mark.filterwarnings(FORKS)
 
 
-def test_a_running_process_is_alive_under_its_own_start_alone() -> None:
+def test_a_running_process_is_alive_only_with_its_start_time() -> None:
     started = start_time(os.getpid())
     assert started > 0
     assert is_alive(os.getpid())
@@ -52,7 +52,7 @@ def test_a_running_process_is_alive_under_its_own_start_alone() -> None:
     assert not is_alive(-1)
 
 
-def test_a_name_with_parentheses_and_spaces_does_not_confuse() -> None:
+def test_a_process_name_may_contain_parentheses_and_spaces() -> None:
     def rename() -> None:
         name_process(") S 1 (x) 2")
         time.sleep(60)
@@ -70,7 +70,7 @@ def test_cores_are_kept_awake_by_a_request_that_is_held(
     monkeypatch.setattr("rack.backplane.process.LATENCY_REQUEST", device)
     with cores_kept_awake() as refusal:
         assert refusal == (
-            f"idle cores sleep, since {device} cannot be opened: No such file or directory"
+            f"idle cores sleep, because {device} cannot be opened: No such file or directory"
         )
     assert not device.exists()
     device.touch()
@@ -96,7 +96,7 @@ def test_the_kernel_says_in_which_state_a_process_is() -> None:
     assert (state_of(pid), processor_ns(pid), mapped_and_locked(pid)) == ("X", 0, (0, 0))
 
 
-def test_processor_time_is_that_of_the_process() -> None:
+def test_processor_time_excludes_other_processes() -> None:
     target = time.process_time_ns() + 30_000_000
     compute_until(target)
     used = time.process_time_ns()
@@ -123,9 +123,9 @@ def test_a_refusal_names_the_limit_that_is_reached() -> None:
     files = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
     processes = resource.getrlimit(resource.RLIMIT_NPROC)[0]
     text = refusal(OSError(errno.EMFILE, "Too many"))
-    assert text == f"Too many: at most {files} open files are permitted (ulimit -n)"
+    assert text == f"Too many: the limit is {files} open files (ulimit -n)"
     text = refusal(OSError(errno.EAGAIN, "Not now"))
-    assert text == f"Not now: at most {processes} processes are permitted (ulimit -u)"
+    assert text == f"Not now: the limit is {processes} processes (ulimit -u)"
     assert refusal(OSError(errno.EACCES, "No")) == f"[Errno {errno.EACCES}] No"
 
 
@@ -167,7 +167,7 @@ SCHED_DEADLINE = 6
 
 
 @needs_deadlines
-def test_a_reservation_is_that_of_the_process_itself_on_its_core_or_on_any() -> None:
+def test_a_reservation_applies_to_the_process_on_its_core_or_on_any_core() -> None:
     cores = os.sched_getaffinity(0)
 
     def take() -> bool:

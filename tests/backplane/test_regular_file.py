@@ -25,7 +25,7 @@ from rack.backplane.regular_file import (
         ("device", "not a regular file, but a character device"),
         ("folder", "not a regular file, but a directory"),
         ("socket", "not a regular file, but a socket"),
-        ("large", "too large, 9 bytes; permitted: 8"),
+        ("large", "too large: 9 bytes; the limit is 8"),
     ],
 )
 def test_only_a_regular_file_of_bounded_size_is_read(
@@ -51,7 +51,7 @@ def test_a_file_of_the_permitted_size_is_read_whole(tmp_path: Path) -> None:
     assert read_regular_file(path, 8) == b"x" * 8
 
 
-def test_the_size_is_bounded_for_a_file_that_says_it_is_empty() -> None:
+def test_the_size_is_bounded_for_a_file_with_a_stated_size_of_zero() -> None:
     path = Path("/proc/self/maps")
     assert path.stat().st_size == 0
     assert len(read_regular_file(path, 1 << 24)) > 100

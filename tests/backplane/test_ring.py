@@ -1,4 +1,4 @@
-"""Rings read in blocks: nothing lost in time, and an exact count of what was."""
+"""Rings read in blocks: no row is lost while there is time, and lost rows are counted exactly."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def serials(ring: Ring) -> tuple[list[int], int]:
     return rows["serial"].tolist(), lost
 
 
-def test_rows_come_in_order_and_once_to_each_reader(bus: Segment) -> None:
+def test_each_reader_gets_every_row_once_and_in_order(bus: Segment) -> None:
     writer, ring, second = open_writer(bus, NAME), MailboxRing(bus, NAME), MailboxRing(bus, NAME)
     assert serials(ring) == ([], 0)
     for first in range(1, 100, 11):
@@ -52,7 +52,7 @@ def test_rows_come_in_order_and_once_to_each_reader(bus: Segment) -> None:
     assert serials(ring) == ([], 0)
 
 
-def test_a_row_is_a_copy_with_its_messages_head(bus: Segment) -> None:
+def test_a_row_is_a_copy_with_the_head_of_its_message(bus: Segment) -> None:
     writer, ring = open_writer(bus, NAME), MailboxRing(bus, NAME)
     writer.write(7, basis=3)
     row = ring.drain().rows[0]

@@ -43,7 +43,7 @@ def refusal(attach: Callable[[], object]) -> str:
     return str(error.value)
 
 
-def test_segment_is_its_users_alone_and_all_of_it_is_allocated(make_bus: MakeBus) -> None:
+def test_a_segment_is_private_to_its_user_and_fully_allocated(make_bus: MakeBus) -> None:
     segment = make_bus(mailbox())
     found = shm_path(segment.rack).stat()
     assert stat.S_IMODE(found.st_mode) == 0o600
@@ -51,7 +51,7 @@ def test_segment_is_its_users_alone_and_all_of_it_is_allocated(make_bus: MakeBus
     assert found.st_blocks * 512 >= found.st_size
 
 
-def test_whoever_attaches_finds_layout_config_and_the_same_memory(make_bus: MakeBus) -> None:
+def test_attached_processes_find_layout_config_and_the_same_memory(make_bus: MakeBus) -> None:
     made = make_bus(mailbox(), mailbox("lock", name="writer.other"), config='name = "näme"\n')
     found = Segment.attach(made.rack)
     assert found.layout == made.layout
@@ -103,13 +103,13 @@ def rename_field(segment: Segment) -> str:
     start = segment.words[Head.LAYOUT_AT]
     text = bytes(segment.bytes[start : start + segment.words[Head.LAYOUT_SIZE]])
     segment.bytes[start : start + len(text)] = text.replace(b'"wake"', b'"woke"')
-    return "layout unreadable"
+    return "the layout is damaged or from another program"
 
 
 def lengthen(segment: Segment) -> str:
     size = len(segment.bytes)
     os.truncate(shm_path(segment.rack), size + 4096)
-    return f"{size + 4096} bytes; its head says {size}"
+    return f"the segment has {size + 4096} bytes, but its head says {size}"
 
 
 @pytest.mark.parametrize("change", [raise_version, change_kind, rename_field, lengthen])
@@ -152,8 +152,8 @@ def test_a_processor_that_reorders_stores_is_refused_before_anything_is_made(
     monkeypatch.setattr(os, "uname", lambda: SimpleNamespace(machine="aarch64"))
     before = descriptors()
     assert refusal(lambda: Segment.create(layout(rack_name, []), "")) == (
-        f"rack '{rack_name}': the processor here is aarch64; the backplane's memory order is argued"
-        " for x86_64 alone; RACK_TRY_PROCESSOR=1 tries it all the same"
+        f"rack '{rack_name}': the processor here is aarch64; the backplane's memory order is proved"
+        " for x86_64 alone; set RACK_TRY_PROCESSOR=1 to try it"
     )
     assert descriptors() == before
     assert rack_name not in racks()
@@ -167,8 +167,8 @@ def test_another_processor_is_tried_on_demand_if_its_words_have_64_bits(
     Segment.create(layout(rack_name, []), "").close()
     unlink(rack_name)
     assert capsys.readouterr().err == (
-        f"rack '{rack_name}': the processor here is aarch64; the backplane's memory order is argued"
-        " for x86_64 alone: nobody has tested this\n"
+        f"rack '{rack_name}': the processor here is aarch64; the backplane's memory order is proved"
+        " for x86_64 alone, and this one is untested\n"
     )
     monkeypatch.setattr(sys, "maxsize", (1 << 31) - 1)
     assert refusal(lambda: Segment.create(layout(rack_name, []), "")) == (
@@ -202,7 +202,7 @@ def test_a_creator_killed_anywhere_leaves_a_whole_segment_or_none(rack_name: str
     assert complete
 
 
-def test_a_launcher_lives_until_it_gives_its_lock_back(make_bus: MakeBus) -> None:
+def test_a_launcher_counts_as_alive_until_it_releases_its_lock(make_bus: MakeBus) -> None:
     segment = make_bus()
     # Record locks of a process would be gone by now.
     Segment.attach(segment.rack).close()
@@ -247,7 +247,7 @@ def test_a_launcher_of_another_pid_namespace_has_no_process_id_here(make_bus: Ma
     assert (segment.launcher, segment.launcher_is_alive) == (0, True)
 
 
-def test_a_segment_knows_when_its_name_means_another(make_bus: MakeBus) -> None:
+def test_a_segment_detects_that_its_name_leads_to_another(make_bus: MakeBus) -> None:
     first = make_bus()
     assert first.has_its_name
     unlink(first.rack)

@@ -1,4 +1,4 @@
-"""The semaphores of a rack: in its segment, for all that attach to it."""
+"""Semaphores of a rack: in its segment, shared by all processes that attach to it."""
 
 from __future__ import annotations
 
@@ -33,27 +33,29 @@ def bus(make_bus: MakeBus) -> Segment:
     )
 
 
-def test_there_are_two_a_task_and_one_a_locked_mailbox_each_in_its_own_line(bus: Segment) -> None:
+def test_tasks_have_two_semaphores_and_locked_mailboxes_one_in_separate_cache_lines(
+    bus: Segment,
+) -> None:
     places = bus.map
     found = [*places.wake.values(), *places.done.values(), *places.locks.values()]
     assert len(found) == len({address // LINE for address in found}) == 5
     assert all(places.windows[-1].address + places.windows[-1].size <= at for at in found)
 
 
-def test_locks_begin_free_and_wake_ups_unsent(bus: Segment) -> None:
+def test_locks_start_free_and_wake_ups_start_unposted(bus: Segment) -> None:
     assert lock_semaphore(bus, NAME).value == 1
     assert wake_semaphore(bus, "writer").value == 0
     assert done_semaphore(bus, "writer").value == 0
 
 
-def test_all_that_attach_have_the_same(bus: Segment) -> None:
+def test_processes_that_attach_share_the_semaphores(bus: Segment) -> None:
     wake_semaphore(bus, "writer").release()
     with closing(Segment.attach(bus.rack)) as other:
         assert wake_semaphore(other, "writer").take()
     assert not wake_semaphore(bus, "writer").take()
 
 
-def test_a_wait_lasts_as_long_as_it_says(bus: Segment) -> None:
+def test_a_wait_lasts_until_its_deadline(bus: Segment) -> None:
     semaphore = wake_semaphore(bus, "writer")
     start = time.monotonic()
     assert not semaphore.acquire(0.02)

@@ -1,4 +1,4 @@
-"""Levels that drive an arm and report nothing: no status, no findings, and no state of the arm."""
+"""Levels that drive an arm without a status, findings or a state of the arm."""
 
 from __future__ import annotations
 

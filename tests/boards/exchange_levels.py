@@ -1,4 +1,4 @@
-"""A level for tests of the exchange: it notes what each of its ports showed."""
+"""A level for tests of the exchange, which records the content of each of its ports."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A level for tests of interrupts: it notes which message of each board below it has."""
+"""A level for tests of interrupts, which records its message of each board below."""
 
 from __future__ import annotations
 

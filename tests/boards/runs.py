@@ -1,4 +1,4 @@
-"""Racks that tests run: with faults in their config, and to their end."""
+"""Racks that tests run to their end, with faults in their config."""
 
 from __future__ import annotations
 

@@ -81,7 +81,7 @@ def test_killed_board_of_a_joint_brakes_the_arm_within_bound_and_the_run_repeats
 
 
 @pytest.mark.slow
-def test_brakes_that_engaged_while_the_arms_board_was_away_have_the_tick_at_which_they_did(
+def test_a_late_report_of_engaged_brakes_has_the_tick_of_the_engagement(
     config: MakeConfig,
 ) -> None:
     given = faulty(config(text=arm_rack(TOGETHER)), kill("arm", KILLED_AT))

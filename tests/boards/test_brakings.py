@@ -1,5 +1,4 @@
-"""Brakes in a run: each time is counted with its reason; a run that they held without a cause in
-sight has failed."""
+"""Engagements of the brakes in a run are counted with their reasons; long ones make it fail."""
 
 from __future__ import annotations
 
@@ -46,7 +45,7 @@ def test_a_stall_longer_than_the_patience_is_one_braking_with_its_time(
         assert stall - 4 < braking.lasted_ms < stall - 4 + 6
 
 
-HELD = "held without a cause in sight"
+HELD = "held without a known cause"
 
 
 @pytest.mark.slow

@@ -76,7 +76,7 @@ CASES = {
         f"first = 0, torques = [{', '.join([NAN] * 160)}]",
         [(0, "command_invalid", "j3")],
         0,
-        "held without a cause in sight, in 400 ms: brakes engaged 1 time",
+        "held without a known cause, in 400 ms: brakes engaged 1 time",
     ),
     "a torque beyond its limit, and no state saved": Case(
         "torques = [1e4], saves = false", [(50, "command_limit", "j3")], 1

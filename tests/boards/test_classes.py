@@ -40,14 +40,14 @@ def test_a_folder_is_put_on_the_import_path_once(folder: Path) -> None:
         ("__name__", "module 'rack.levels.servo' has no Planner named '__name__'; it has: "),
     ],
 )
-def test_what_is_no_such_class_is_refused_with_those_there_are(name: str, why: str) -> None:
+def test_an_unknown_class_is_refused_with_the_existing_ones(name: str, why: str) -> None:
     with pytest.raises(LookupError) as error:
         find_class(f"rack.levels.servo:{name}", Planner)
     assert str(error.value).startswith(why)
     assert str(error.value).endswith(" it has: ServoPlanner")
 
 
-def test_a_module_without_any_says_so() -> None:
+def test_a_module_without_suitable_classes_is_refused() -> None:
     with pytest.raises(LookupError, match=r"it has: none$"):
         find_class("rack.levels.errors:Level", Executor)
 

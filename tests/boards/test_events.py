@@ -1,5 +1,4 @@
-"""The end of a run judged from what is on its backplane: its cause, what held it, where objects
-ended."""
+"""The end of a run, judged from its backplane: its cause, long holds, positions of objects."""
 
 from __future__ import annotations
 
@@ -171,12 +170,12 @@ def test_brakes_hold_a_run_if_they_are_long_or_often_engaged(
     bus: Segment, found: tuple[Braking, ...], is_held: bool
 ) -> None:
     lines = list(ending(bus).held([], found, RAN_MS))
-    text = f"held without a cause in sight, in {RAN_MS:g} ms: {braked_text(found)}" if found else ""
+    text = f"held without a known cause, in {RAN_MS:g} ms: {braked_text(found)}" if found else ""
     assert lines == ([text] if is_held else [])
 
 
 @pytest.mark.parametrize("kind", ["fault", "command"])
-def test_with_a_cause_in_sight_nothing_is_held(bus: Segment, kind: Any) -> None:
+def test_holds_with_a_known_cause_are_not_reported(bus: Segment, kind: Any) -> None:
     assert list(ending(bus).held([Event(0, 0, "miss", "", "")], [LONG], RAN_MS))
     assert not list(ending(bus).held([Event(0, 0, kind, "", "")], [LONG], RAN_MS))
     bus.words[System.DEMAND] = 1
@@ -203,7 +202,7 @@ def test_a_level_that_holds_for_long_is_named(bus: Segment) -> None:
     block[Block.LEVEL_SINCE] = 400
     assert list(ending(bus).held([], [], 1000.0 + HELD_MS)) == []
     assert list(ending(bus).held([], [], 1000.0 + HELD_MS + 1.0)) == [
-        "level 'upper' held for 5001 ms without a cause in sight: waits for a part"
+        "level 'upper' held for 5001 ms without a known cause: waits for a part"
     ]
     block[Block.LEVEL_STATE] = State.EXECUTING
     assert list(ending(bus).held([], [], 1000.0 + HELD_MS + 1.0)) == []
@@ -218,7 +217,7 @@ def test_objects_end_where_they_were_sensed_last(bus: Segment) -> None:
     assert str(end) == "object 'block' ended 4 mm from its goal (tolerance 5 mm)"
 
 
-def test_a_journal_stamps_what_happens_and_passes_it_on(bus: Segment) -> None:
+def test_a_journal_stamps_events_and_passes_them_on(bus: Segment) -> None:
     heard: list[Event] = []
     journal = Journal(heard.append)
     journal.add("launch", "rack", "first")
@@ -237,7 +236,7 @@ def test_a_journal_stamps_what_happens_and_passes_it_on(bus: Segment) -> None:
     Journal(None).add("launch", "rack", "nobody listens")
 
 
-def test_brakings_are_those_reported_as_over_and_the_one_that_lasts_to_the_end() -> None:
+def test_brakings_include_finished_ones_and_the_one_at_the_end() -> None:
     def change(tick: int, code: str, why: str, value: int = 0) -> Event:
         return Event(0, tick, "reaction", "arm", "", code, subject=why, value=value)
 

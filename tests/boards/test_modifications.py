@@ -146,7 +146,7 @@ def test_a_modification_is_in_force_from_the_cycle_after_its_tick_without_a_step
 
 
 @pytest.mark.slow
-def test_a_run_with_switches_repeats_and_equals_that_without_modifications_up_to_the_first(
+def test_a_run_with_switches_repeats_and_equals_an_unmodified_run_up_to_the_first_switch(
     switched: Ran, without: Ran, run: Callable[..., Ran]
 ) -> None:
     again = run(SWITCHED)
@@ -159,7 +159,7 @@ def test_a_run_with_switches_repeats_and_equals_that_without_modifications_up_to
 
 
 @pytest.mark.slow
-def test_one_that_fails_is_taken_out_with_its_reason_in_status_and_events_and_the_arm_goes_on(
+def test_a_failed_modification_is_removed_with_its_reason_and_the_arm_continues(
     switched: Ran,
 ) -> None:
     assert switched.reason(649) == "modified by pd, breaks"

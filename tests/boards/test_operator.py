@@ -146,7 +146,7 @@ def test_a_restarted_board_has_its_live_params_as_they_were_set(
         " set; it takes: hold, resume, goto home",
     }.items(),
 )
-def test_a_setting_that_cannot_be_is_one_line(
+def test_an_impossible_setting_is_refused_in_one_line(
     commanded: Callable[..., RackConfig], table: str, line: str
 ) -> None:
     with pytest.raises(ConfigError) as caught:
@@ -155,7 +155,9 @@ def test_a_setting_that_cannot_be_is_one_line(
 
 
 @pytest.mark.slow
-def test_a_refusal_is_answered_and_goes_no_further(commanded: Callable[..., RackConfig]) -> None:
+def test_a_refused_command_is_answered_and_not_passed_down(
+    commanded: Callable[..., RackConfig],
+) -> None:
     _, _, boxes = run(commanded(commands("level='upper', what='goto', home=true, tick=50")))
     last = boxes["upper.status"]["message"][-1]
     assert (last["order"], last["answer"], last["standing"]) == (1, Answer.REFUSED, Operation.NONE)

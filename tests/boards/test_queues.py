@@ -188,7 +188,7 @@ def test_a_planner_takes_every_request_between_its_plans(config: MakeConfig) -> 
         (("protocol.depth={ 'upper.requests' = 0 }",), "protocol.depth"),
     ],
 )
-def test_queues_that_make_no_sense_are_refused_in_one_line(
+def test_invalid_queues_are_refused_in_one_line(
     config: MakeConfig, settings: tuple[str, ...], expected: str
 ) -> None:
     found = mistakes(config, *settings)

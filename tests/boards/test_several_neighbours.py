@@ -43,7 +43,7 @@ def at(rows: np.ndarray, tick: int) -> np.void:
 
 
 @pytest.mark.slow
-def test_a_message_that_rests_on_many_rests_on_the_oldest_of_them(jointed: MakeConfig) -> None:
+def test_the_basis_of_a_message_is_the_oldest_of_several_sources(jointed: MakeConfig) -> None:
     written = run(jointed("board.joint2.rate_hz=100"))[1].messages
     # joint1 rests on the arm's cycle one tick before its own, joint2 on that before its last cycle
     # at a multiple of 4.
@@ -95,7 +95,7 @@ def test_boards_restart_after_all_that_are_below_them_and_wait_for_no_other(
     ]
 
 
-def test_information_is_followed_by_what_each_message_rests_on(jointed: MakeConfig) -> None:
+def test_information_is_traced_through_the_sources_of_each_message(jointed: MakeConfig) -> None:
     config = jointed()
     layout = wire(config)
     down = mailboxes_along(layout, ("path", "joint2", "arm"))

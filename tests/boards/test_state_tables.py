@@ -48,7 +48,7 @@ def test_tables_are_swapped_at_a_tick_and_every_run_alike(counter: MakeConfig) -
 
 
 @pytest.mark.slow
-def test_a_restarted_board_reads_its_file_anew_and_goes_on_in_its_state(
+def test_a_restarted_board_reads_its_file_again_and_continues_in_its_state(
     counter: MakeConfig, tmp_path: Path
 ) -> None:
     with Rack(counter(EDIT)) as rack:
@@ -77,7 +77,7 @@ def test_a_table_with_a_hole_is_refused_with_its_state_and_case(
     )
 
 
-def test_unknown_tables_and_commands_are_refused_with_those_that_there_are(
+def test_unknown_tables_and_commands_are_refused_with_the_known_ones(
     counter: MakeConfig,
 ) -> None:
     given = commands(

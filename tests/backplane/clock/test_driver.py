@@ -47,7 +47,7 @@ def given_out(
     return ticks
 
 
-def test_a_run_stops_at_its_tick_and_wakes_everybody(make_bus: MakeBus) -> None:
+def test_a_run_stops_at_its_tick_and_wakes_all_tasks(make_bus: MakeBus) -> None:
     segment = make_bus()
     start(segment)
     posts = [wake_semaphore(segment, name) for name in ("writer", "reader")]
@@ -124,7 +124,7 @@ def test_the_controller_works_before_and_after_the_releases_of_each_tick(
     assert wake_semaphore(segment, "poller").value == 1
 
 
-def test_a_late_clock_leaves_ticks_out_and_counts_them(make_bus: MakeBus) -> None:
+def test_a_late_clock_skips_ticks_and_counts_them(make_bus: MakeBus) -> None:
     segment, held_up = make_bus(), []
 
     def hold_up(tick: int) -> None:

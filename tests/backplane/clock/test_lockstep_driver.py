@@ -94,7 +94,7 @@ def test_a_lockstep_tick_begins_when_every_task_due_has_finished(
 @pytest.mark.slow
 @pytest.mark.parametrize("flooded", [False, True])
 @pytest.mark.parametrize("wake", get_args(Wake))
-def test_one_at_a_time_means_one_after_the_other(
+def test_tasks_run_one_after_the_other_if_configured(
     make_bus: MakeBus, wake: Wake, flooded: bool
 ) -> None:
     planner = task("planner", slot=4, role="planner", wake=wake)
@@ -150,7 +150,7 @@ def test_lockstep_waits_without_a_bound_for_a_recorder_that_lives(
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP], ids=["dead", "stopped"])
-def test_a_recorder_that_nobody_replaces_is_not_waited_for_long(
+def test_the_wait_for_a_dead_recorder_is_bounded(
     make_bus: MakeBus, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
 ) -> None:
     monkeypatch.setattr("rack.backplane.clock.lockstep.IDLE_S", 0.05)
@@ -180,7 +180,7 @@ def test_a_stop_ends_lockstep_though_a_task_hangs(make_bus: MakeBus) -> None:
         (5, 3, False, False),
     ],
 )
-def test_how_far_the_clock_may_be_ahead_of_its_recorder(
+def test_the_lead_of_the_clock_over_its_recorder_is_bounded(
     make_bus: MakeBus, ticks: int, drained: int, flooded: bool, is_ahead: bool
 ) -> None:
     segment = make_bus(task("level"))
@@ -243,7 +243,7 @@ def test_an_executor_that_alone_is_due_gets_its_ticks_at_once(make_bus: MakeBus)
         (System.HOLD_AT, 1, 2),
     ],
 )
-def test_a_batch_ends_where_the_run_ends_or_is_held(
+def test_a_batch_ends_at_the_end_of_the_run_or_at_a_hold(
     make_bus: MakeBus, word: int, value: int, end: int
 ) -> None:
     segment = make_bus(task("fast", slot=2), task("slow", every=40, slot=3))
@@ -254,7 +254,7 @@ def test_a_batch_ends_where_the_run_ends_or_is_held(
     assert driver._batch_end(driver.due(1, 0), 1) == end
 
 
-def test_a_batch_ends_before_what_the_clock_must_do(make_bus: MakeBus) -> None:
+def test_a_batch_ends_before_the_next_work_of_the_clock(make_bus: MakeBus) -> None:
     segment = make_bus(task("fast", slot=2), task("slow", every=40, slot=3))
     driver = LockstepDriver(segment, lambda tick: None, False, HISTORY)
     driver.controller = Idle(until=7)

@@ -30,7 +30,7 @@ LONG_NS = 20_000_000
 
 @pytest.fixture
 def wake(request: pytest.FixtureRequest) -> Wake:
-    """How the task waits; by signal, unless a test has other wishes."""
+    """How the task waits: by signal, unless the test is parametrized otherwise."""
     return getattr(request, "param", "signal")
 
 
@@ -86,7 +86,7 @@ def test_a_late_task_skips_passed_releases_and_counts_them(bus: Segment) -> None
 
 
 @pytest.mark.parametrize(("releases", "skipped"), [((4, 8, 12), 0), ((20,), 2)])
-def test_a_planner_at_work_takes_no_release_and_skips_none(
+def test_a_busy_planner_takes_no_release_and_skips_none(
     bus: Segment, releases: tuple[int, ...], skipped: int
 ) -> None:
     cycle = NextCycle(bus, "level")
@@ -172,7 +172,7 @@ def test_a_sleeping_task_takes_a_release_at_its_grid_point_and_not_before(bus: S
 
 
 @TIMER
-def test_a_sleeping_task_sleeps_on_to_its_next_grid_point_if_the_clock_skips_one(
+def test_a_sleeping_task_sleeps_until_its_next_grid_point_if_the_clock_skips_one(
     bus: Segment,
 ) -> None:
     cycle = NextCycle(bus, "level")

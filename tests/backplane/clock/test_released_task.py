@@ -1,4 +1,4 @@
-"""A task as the clock sees it: what a release writes, when it is finished, lost, and back."""
+"""A task as the clock sees it: released, finished, lost and rejoined."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_missed_releases_count_from_the_last_that_was_finished(released: Release
     assert released.missed == 1
 
 
-def test_a_tick_waits_for_a_task_whose_deadline_it_is(released: ReleasedTask) -> None:
+def test_a_tick_waits_for_a_task_with_this_deadline(released: ReleasedTask) -> None:
     released.release(5)
     released.block[Block.DONE] = 1
     assert [released.is_finished(tick) for tick in (8, 9)] == [True, False]
@@ -79,7 +79,7 @@ def test_a_tick_waits_for_a_task_whose_deadline_it_is(released: ReleasedTask) ->
     assert released.is_finished(9)
 
 
-def test_a_lost_task_is_as_it_was_found_until_it_has_rejoined(released: ReleasedTask) -> None:
+def test_a_lost_task_stays_lost_until_it_has_rejoined(released: ReleasedTask) -> None:
     released.release(5)
     assert released.lost_tick == -1
     released.lose(7)
@@ -98,7 +98,7 @@ def test_a_lost_task_is_as_it_was_found_until_it_has_rejoined(released: Released
 
 
 @pytest.mark.parametrize("state", TaskState)
-def test_its_state_says_whether_it_is_ready_or_given_up(
+def test_the_state_of_a_lost_task_tells_whether_it_is_ready_or_given_up(
     released: ReleasedTask, state: TaskState
 ) -> None:
     released.block[Block.STATE] = state

@@ -71,7 +71,7 @@ def test_an_impossible_rate_is_refused(rate_hz: float) -> None:
         ticks_of(rate_hz, CLOCK_NS, "level")
 
 
-def test_in_real_time_the_grid_says_which_tick_has_come(make_bus: MakeBus) -> None:
+def test_the_current_tick_follows_the_grid_in_real_time(make_bus: MakeBus) -> None:
     segment = make_bus()
     segment.words[System.EPOCH_NS], segment.words[System.PERIOD_NS] = 1_000, 2_500_000
     clock = SystemClock(segment)
@@ -83,7 +83,7 @@ def test_in_real_time_the_grid_says_which_tick_has_come(make_bus: MakeBus) -> No
     assert (clock.now(), clock.tick) == (7, 0)
 
 
-def test_in_lockstep_the_clock_board_says_it_and_the_end_of_the_run(make_bus: MakeBus) -> None:
+def test_the_clock_board_sets_the_current_tick_in_lockstep(make_bus: MakeBus) -> None:
     segment = make_bus()
     segment.words[System.LOCKSTEP], segment.words[System.TICK] = 1, 12
     clock, seen = SystemClock(segment), []

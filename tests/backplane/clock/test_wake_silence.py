@@ -1,5 +1,4 @@
-"""A stopped clock, found by a task that waits for it: an alarm needs proof, a late clock gives
-none."""
+"""A stopped clock is found by a waiting task. An alarm needs proof, and a late clock gives none."""
 
 from __future__ import annotations
 
@@ -97,7 +96,7 @@ def test_a_clock_that_could_run_is_only_late(watched: Silence) -> None:
 
 
 @pytest.mark.parametrize("newest", [0, 1, 2, 7])
-def test_a_clock_that_waits_for_too_long_is_reported_at_the_second_look(
+def test_a_clock_that_waits_for_too_long_is_reported_at_the_second_check(
     watched: Silence, newest: int
 ) -> None:
     watched.state = "S"
@@ -107,7 +106,7 @@ def test_a_clock_that_waits_for_too_long_is_reported_at_the_second_look(
     assert len(watched.check(newest + LONG + 1)) == 1
 
 
-def test_a_tick_or_a_look_that_finds_it_ready_to_run_disproves_a_silence(watched: Silence) -> None:
+def test_a_tick_or_a_check_that_finds_the_clock_runnable_ends_a_silence(watched: Silence) -> None:
     watched.tick(1)
     alarms = []
     for tick, state in ((1, "S"), (2, "S"), (2, "R"), (2, "S"), (2, "S")):
@@ -117,7 +116,7 @@ def test_a_tick_or_a_look_that_finds_it_ready_to_run_disproves_a_silence(watched
     assert alarms == [0, 0, 0, 0, 1]
 
 
-def test_a_tick_made_meanwhile_or_the_end_of_the_run_disproves_a_stop(watched: Silence) -> None:
+def test_a_later_tick_or_the_end_of_the_run_disproves_a_stop(watched: Silence) -> None:
     watched.state = "T"
     watched.tick(7)
     watched.while_asked = lambda: watched.tick(12)

@@ -46,7 +46,7 @@ class Watched:
         return self._watchdog.losses
 
 
-def test_a_late_answer_is_one_miss(make_bus: MakeBus) -> None:
+def test_a_late_cycle_counts_as_one_miss(make_bus: MakeBus) -> None:
     watched = Watched(make_bus(), os.getpid())
     watched.release(True)
     assert [watched.release(True) for _ in range(5)] == [[]] * 5

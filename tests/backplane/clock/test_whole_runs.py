@@ -1,5 +1,4 @@
-"""The clock in whole racks in lockstep that lose boards and ticks: what is released, awaited, held,
-lost and taken back stays as it was."""
+"""Clocks of whole racks that lose boards and ticks behave as recorded."""
 
 from __future__ import annotations
 
@@ -32,7 +31,7 @@ LOST: tuple[dict[str, Any], ...] = (
 
 
 @pytest.mark.parametrize("case", RACKS)
-def test_the_clock_of_a_rack_does_what_it_did(
+def test_the_recorded_run_of_the_clock_is_unchanged(
     case: str,
     config: MakeConfig,  # noqa: F811
 ) -> None:

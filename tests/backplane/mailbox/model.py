@@ -31,7 +31,7 @@ LOSE = ("fence", "store head")
 CLAIM = ("store claim", "clear slot")
 READ = ("load head", "fence", "load signature", "fence", "load message")
 JUDGE = ("fence", "load head")
-"""How a reader learns whether a slot that it has copied was reused meanwhile."""
+"""Accesses by which a reader learns whether a slot was reused while it was copied."""
 SIGNATURE = "e"
 EMPTY = 0
 EPOCHS = 8
@@ -48,31 +48,31 @@ class Memory(Enum):
 
 @dataclass(frozen=True)
 class Setup:
-    """What is explored.
+    """Bounds and variants of the exploration.
 
     Attributes:
         memory: Order of accesses.
         depth: Slots of the ring.
-        published: Messages that are there at the beginning.
-        messages: Messages published after that, at most.
-        kills: How often the writer is killed, at most.
-        losses: Serials published without a message, at most.
-        forgeries: Messages published by a process without the claim, at most; each at once, and
-            not while the writer publishes.
+        published: Messages that exist at the beginning.
+        messages: Maximum number of messages published after that.
+        kills: Maximum number of times that the writer is killed.
+        losses: Maximum number of serials published without a message.
+        forgeries: Maximum number of messages published by a process without the claim. Each is
+            published at once, and not while the writer publishes.
         readers: Number of readers.
-        reads: Reads of each of them.
-        words: Words of a slot: e, epoch of the writer; s, serial; p, content; c, checksum. Those in
-            one group are copied together.
+        reads: Reads of each reader.
+        words: Words of a slot: e, epoch of the writer; s, serial; p, content; c, checksum.
+            Words of one group are copied together.
         publish: Accesses of a writer that publishes a message.
-        lose: Accesses of one that publishes a serial without its message.
-        claim: Accesses of one that begins.
+        lose: Accesses of a writer that publishes a serial without its message.
+        claim: Accesses of a writer that begins.
         read: Accesses of a reader that takes a message. If it does not know the writer yet, it
             loads the claim, too.
-        judge: Its accesses after a bad copy.
-        is_checked: Whether it checks the checksum.
-        is_claimed: Whether it checks the writer.
-        is_locked: Whether a writer begins only after its predecessor is dead.
-        waits: Whether it waits while its slot is being filled.
+        judge: Accesses of a reader after a bad copy.
+        is_checked: True if a reader checks the checksum.
+        is_claimed: True if a reader checks the writer.
+        is_locked: True if a writer begins only after its predecessor is dead.
+        waits: True if a reader waits while its slot is being filled.
     """
 
     memory: Memory
@@ -202,7 +202,7 @@ class _Model:
         self._is_early = self._is_weak and "fence" not in setup.judge
 
     def _is_unordered(self, accesses: Sequence[str], first: str, second: str) -> bool:
-        """Say whether the second of two loads may come before the first."""
+        """Check whether the second of two loads may come before the first."""
         start, end = accesses.index(first), accesses.index(second)
         return end < start or (self._is_weak and "fence" not in accesses[start:end])
 
@@ -275,7 +275,7 @@ class _Model:
                 yield store, stores[:number] + stores[number + 1 :]
 
     def _may_issue(self, writer: Writer) -> bool:
-        """Say whether a writer may begin with one more publication."""
+        """Check whether a writer may begin with one more publication."""
         begun = {store.publication for store in writer.stores} - {0}
         return writer.issued < self._last and len(begun) < self._ahead
 
@@ -313,7 +313,7 @@ class _Model:
         return writer._replace(issued=serial, stores=tuple(stores))
 
     def _is_before(self, earlier: Store, later: Store) -> bool:
-        """Say whether the memory keeps two stores of a program in order."""
+        """Check whether the memory keeps two stores of a program in order."""
         if self._is_weak:
             is_same = earlier[:1] + earlier[2:4] == later[:1] + later[2:4]
             return is_same or earlier.section < later.section
@@ -363,7 +363,7 @@ class _Model:
         yield f"begin, epoch {epoch}", state._replace(writers=(*others, writer))
 
     def _is_publishing(self, writer: Writer) -> bool:
-        """Say whether a writer has made some of the stores of a publication."""
+        """Check whether a writer has made some of the stores of a publication."""
         whole = (0, len(self._setup.words) + 1)
         return bool(writer.buffer) or len(writer.stores) not in whole
 
@@ -429,7 +429,7 @@ class _Model:
         return Reader(reader.last, reader.known, reader.reads - 1)
 
     def _is_good(self, reader: Reader) -> bool:
-        """Say whether a copy is of the message sought, and whole."""
+        """Check whether a copy is of the message sought, and whole."""
         copied = reader.copied
         serial = copied[self._serial]
         is_whole = serial == copied[self._content] == copied[self._check]
@@ -444,7 +444,7 @@ class _Model:
         )
 
     def _is_bad(self, reader: Reader) -> bool:
-        """Say whether the reader has seen that it cannot take its copy."""
+        """Check whether the reader has seen that it cannot take its copy."""
         if min(reader.copied) < 0:
             return False
         return not self._is_good(reader) or (reader.claim >= 0 and not self._is_lawful(reader))

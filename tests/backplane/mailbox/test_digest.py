@@ -41,7 +41,7 @@ def test_equal_messages_have_equal_chains_whenever_they_were_written(bus: Segmen
 
 
 @pytest.mark.parametrize("values", [[1, 2], [1, 2, 4], [2, 1, 3], [0, 2, 3], [1, 2, 3, 3]])
-def test_any_difference_shows(bus: Segment, values: list[int]) -> None:
+def test_any_difference_changes_the_digest(bus: Segment, values: list[int]) -> None:
     write(bus, NAME, [1, 2, 3])
     write(bus, OTHER, values)
     found = chains(bus, 100)
@@ -70,7 +70,7 @@ def test_the_chain_covers_overwritten_messages(bus: Segment) -> None:
     assert chains(bus, 3)[NAME][1] == 0
 
 
-def test_a_damaged_message_has_no_hash_and_the_one_before_it_has(bus: Segment) -> None:
+def test_the_chain_of_a_damaged_message_is_replaced_by_the_one_before_it(bus: Segment) -> None:
     write(bus, NAME, list(range(500)))
     before = chains(bus, 999)[NAME]
     bus.bytes[message_address(bus, 500)] ^= 1

@@ -48,7 +48,7 @@ def test_messages_come_once_and_in_order(segment: Segment) -> None:
     assert taken(HostReader(segment, NAME)) == [5, 6]
 
 
-def test_a_full_ring_refuses_and_loses_nothing_that_waits(segment: Segment) -> None:
+def test_a_full_ring_refuses_messages_and_keeps_the_waiting_ones(segment: Segment) -> None:
     writer, reader = HostWriter(segment, NAME), HostReader(segment, NAME)
     sent = [send(writer, number) for number in range(1, 9)]
     assert sent == [True] * CAPACITY + [False] * 3
@@ -58,7 +58,7 @@ def test_a_full_ring_refuses_and_loses_nothing_that_waits(segment: Segment) -> N
     assert taken(reader) == [2, 3, 4, 5, 9]
 
 
-def test_the_newest_overtakes_the_others(segment: Segment) -> None:
+def test_the_newest_message_supersedes_the_others(segment: Segment) -> None:
     writer, reader = HostWriter(segment, NAME), HostReader(segment, NAME)
     for number in (1, 2, 3):
         send(writer, number)
@@ -76,7 +76,7 @@ def test_a_damaged_message_is_refused_and_the_next_one_is_not(segment: Segment) 
     assert (taken(reader), reader.refused) == ([1, None, 3], 1)
 
 
-def test_a_writer_that_keeps_to_no_bound_overwrites_what_waits_and_is_counted(
+def test_messages_overwritten_by_an_unbounded_writer_are_counted(
     segment: Segment,
 ) -> None:
     writer, reader = HostWriter(segment, NAME), HostReader(segment, NAME)
@@ -88,9 +88,7 @@ def test_a_writer_that_keeps_to_no_bound_overwrites_what_waits_and_is_counted(
     assert (reader.superseded, reader.refused) == (13, 0)
 
 
-def test_lengths_beyond_those_declared_and_text_beyond_ascii_are_improper_empty_groups_not() -> (
-    None
-):
+def test_undeclared_lengths_and_non_ascii_texts_are_improper_but_empty_groups_are_not() -> None:
     fields, message = field_specs(Number.message_type, {}), Number.zeros({})
     for value, colour, permitted in ((0.0, 0, True), (0.0, 2, False), (np.nan, 1, False)):
         message.value, message.colour = value, colour

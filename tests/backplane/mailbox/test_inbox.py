@@ -1,5 +1,4 @@
-"""The arithmetic of an inbox: one served at a time, in order of arrival, as many waiting as
-permitted."""
+"""Timing of an inbox: one message served at a time, in order of arrival, within its bound."""
 
 from __future__ import annotations
 
@@ -15,7 +14,7 @@ ARRIVALS = st.lists(st.tuples(st.integers(0, 40), st.integers(0, 30)), max_size=
 """Pauses before messages, and their services."""
 
 
-def test_one_that_arrives_while_too_many_wait_is_lost_and_costs_nothing() -> None:
+def test_a_message_for_a_full_inbox_is_lost_and_takes_no_service_time() -> None:
     inbox = Inbox(2)
     assert [inbox.arrive(0, 60) for _ in range(4)] == [60, 120, 180, None]
     # At 60 the first is done: a place to wait is free again.
@@ -49,7 +48,7 @@ def test_a_burst_of_all_senders_waits_for_each_other() -> None:
     assert not burst.fits(3)
 
 
-def test_a_burst_includes_what_comes_while_it_is_served() -> None:
+def test_a_burst_includes_messages_that_arrive_during_its_service() -> None:
     # From 0: 300 of service, during which the fast source comes twice more.
     burst = burst_of([InterruptSource(100, 10), InterruptSource(1_000, 250)])
     assert burst.longest_ns == 260

@@ -1,4 +1,4 @@
-"""Protocol interrupt on a bus: what a board's reader sees when, and what it never sees."""
+"""Protocol interrupt on a bus: the messages that a board's reader sees, and when."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Board:
         self.restart()
 
     def restart(self) -> None:
-        """Open the reader's end anew, as a restarted task does."""
+        """Open the reader again, as a restarted task does."""
         inbox = open_inbox(self.segment, "reader")
         assert inbox is not None
         self.inbox: BoardInbox = inbox
@@ -111,7 +111,7 @@ def test_a_message_written_in_the_tick_in_which_it_is_due_is_late(make_bus: Make
     assert [writer.visible_at(8, now) for now in (None, 8, 10, 11, 12)] == [11, 11, 11, 12, 13]
 
 
-def test_one_that_is_served_across_a_release_shows_at_the_next(make_bus: MakeBus) -> None:
+def test_a_message_served_across_a_release_is_visible_at_the_next(make_bus: MakeBus) -> None:
     # Each takes 0.9 ms: from 0.5 ms on the handler is done at 1.4, 2.3 and 3.2 ms, with a release
     # at 2.5.
     board = Board(make_bus(*boxes(service_ns=900_000), *tasks()))
@@ -122,7 +122,7 @@ def test_one_that_is_served_across_a_release_shows_at_the_next(make_bus: MakeBus
     assert (board.inbox.count, board.inbox.service_ns) == (3, 2_700_000)
 
 
-def test_a_full_inbox_loses_what_comes_last_at_this_board_only(make_bus: MakeBus) -> None:
+def test_a_full_inbox_loses_the_last_messages_at_this_board_only(make_bus: MakeBus) -> None:
     board = Board(make_bus(*boxes(depth=1), *tasks()))
     for tick in range(5):
         board.send(tick)

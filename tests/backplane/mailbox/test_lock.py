@@ -35,11 +35,11 @@ def hold(segment: Segment) -> None:
 
 
 def obtains(lock: MailboxLock) -> bool:
-    """Say whether a lock can be obtained within a few of its bounds."""
+    """Check whether a lock can be obtained within a few of its bounds."""
     return any(lock.acquire() for _ in range(3))
 
 
-def test_an_access_that_its_bound_cut_off_is_a_bus_error(bus: Segment) -> None:
+def test_an_access_that_times_out_is_a_bus_error(bus: Segment) -> None:
     writer, reader = open_writer(bus, NAME), open_reader(bus, NAME)
     with forked(lambda: hold(bus)):
         wait_until(lambda: bus.words[REPORT])
@@ -60,7 +60,7 @@ def test_an_access_that_its_bound_cut_off_is_a_bus_error(bus: Segment) -> None:
     assert reader.read(2).is_new
 
 
-def test_a_read_that_a_dead_holder_held_up_is_counted_once(bus: Segment) -> None:
+def test_a_read_delayed_by_a_dead_holder_is_counted_once(bus: Segment) -> None:
     reader = open_reader(bus, NAME)
     holder = fork(lambda: hold(bus))
     wait_until(lambda: bus.words[REPORT])

@@ -1,5 +1,4 @@
-"""The protocol of the mailbox, checked in every state that its model can come to; and mistakes in
-it, each of which the model finds."""
+"""The mailbox protocol is checked in every state of its model, and mutants of it are detected."""
 
 from __future__ import annotations
 

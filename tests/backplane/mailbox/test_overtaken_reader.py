@@ -109,10 +109,10 @@ class Overtaken:
 
     def _write_half(self) -> None:
         """Leave the writer in the middle of the copy of one more message into its slot."""
-        serial, stride = self._slots.box[0] + 1, len(self._slots.ring) // DEPTH
+        serial = self._slots.box[0] + 1
         self._slots.fetch(serial - 1)
-        half, start = len(self._slots.record) // 2, serial % DEPTH * stride
-        self._slots.ring[start : start + half] = self._slots.record[:half]
+        half = len(self._slots.record) // 2
+        self._slots.places[serial % DEPTH][:half] = self._slots.record[:half]
 
 
 @pytest.mark.parametrize("protocol", ["time-slice", "double-buffer"])

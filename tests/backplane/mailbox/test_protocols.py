@@ -37,7 +37,7 @@ def hammer(segment: Segment) -> None:
 
 
 def is_whole(reader: Reader) -> bool:
-    """Say whether the last good message holds its own serial everywhere."""
+    """Check whether the last good message holds its own serial everywhere."""
     row = reader.message.row
     return reader.message.id == row[0] == reader.serial and bool((row == row[0]).all())
 
@@ -83,7 +83,7 @@ def test_a_reader_never_gets_half_a_message(make_bus: MakeBus, protocol: Protoco
 
 
 def follows(slots: Slots, serial: int) -> bool:
-    """Say whether a message's checksum is seeded with that of the message before it."""
+    """Check whether a message's checksum is seeded with that of the message before it."""
     assert slots.fetch(serial - 1)
     before = slots.chain
     assert slots.fetch(serial)

@@ -1,5 +1,4 @@
-"""Queues: each message once and in order, bounded, visible by ticks, whoever is killed and whatever
-is damaged."""
+"""Queues: each message once and in order, whoever is killed and whatever is damaged."""
 
 from __future__ import annotations
 
@@ -73,7 +72,7 @@ def test_reader_takes_no_more_than_it_has_room_for(make_bus: MakeBus) -> None:
     ]
 
 
-def test_a_full_queue_is_a_verdict_and_keeps_what_it_holds(make_bus: MakeBus) -> None:
+def test_a_full_queue_refuses_messages_and_keeps_the_unread_ones(make_bus: MakeBus) -> None:
     segment = make_bus(*queue(3))
     writer, reader = ends(segment)
     assert writer.room() == 3
@@ -121,7 +120,7 @@ def test_a_late_write_becomes_visible_at_the_next_boundary(
     assert [ids(reader.read(tick)) for tick in (7, 8, 12)] == [[], [1][:in_time], [1][in_time:]]
 
 
-def test_an_observer_takes_nothing(make_bus: MakeBus) -> None:
+def test_an_observer_takes_no_message_from_a_queue(make_bus: MakeBus) -> None:
     segment = make_bus(*queue(8))
     writer, reader = ends(segment)
     send(writer, 0, 1, 2)

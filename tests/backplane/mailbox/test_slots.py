@@ -1,4 +1,4 @@
-"""The slots of a mailbox: copies of what stands in them."""
+"""Slots of a mailbox: copies of their content."""
 
 from __future__ import annotations
 

@@ -57,7 +57,7 @@ def test_a_writer_that_finishes_cycles_without_a_message_is_mute(link: MakeLink)
     assert rack.alarms() == [(42, Alarm.MUTE)]
 
 
-def test_a_write_cut_off_by_a_lock_is_not_mute(link: MakeLink) -> None:
+def test_a_write_that_timed_out_at_a_lock_is_not_mute(link: MakeLink) -> None:
     rack = link("lock")
     rack.run(0, 20)
     for tick in range(20, 30):
@@ -105,7 +105,7 @@ def test_a_marked_loss_shows_from_the_next_tick(link: MakeLink) -> None:
     assert not rack.reader.cycle(22).is_lost
 
 
-def test_a_lost_writer_that_never_wrote_gives_nothing_to_hold(link: MakeLink) -> None:
+def test_a_lost_writer_that_never_wrote_does_not_count_as_lost(link: MakeLink) -> None:
     rack = link()
     rack.segment.block("writer")[Block.LOST] = 1
     assert not rack.reader.cycle(5).is_lost

@@ -1,5 +1,4 @@
-"""Faults of messages on one mailbox, by every protocol and at several rates: what is written, read
-and reported stays as it was."""
+"""Message faults under every protocol and at several rates have their recorded effects."""
 
 from __future__ import annotations
 
@@ -39,7 +38,7 @@ def link(rack_name: str) -> Iterator[MakeLink]:
 
 @pytest.mark.parametrize("fault", FAULTS)
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_a_link_lives_through_faults_as_it_did(
+def test_the_recorded_fault_story_of_a_link_is_unchanged(
     link: MakeLink, fault: str, protocol: Protocol
 ) -> None:
     SNAPSHOTS.check(

@@ -1,4 +1,4 @@
-"""A queue that is watched: what of its messages is reported, and when its writer counts as lost."""
+"""A watched queue: faults reported about its messages, and the loss of its writer."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_messages_in_order_raise_no_alarm(site: Site) -> None:
     assert (site.alarms(), site.task.troubles) == ([], 0)
 
 
-def test_a_lost_message_is_a_gap_and_a_trouble(site: Site) -> None:
+def test_a_lost_message_is_reported_as_a_gap_and_counted_as_trouble(site: Site) -> None:
     site.send(0, 1)
     assert site.read(1) == [1]
     site.writer.visible_at(2, None)
@@ -87,7 +87,7 @@ def test_a_lost_message_is_a_gap_and_a_trouble(site: Site) -> None:
     assert (site.alarms(), site.task.troubles) == ([], 1)
 
 
-def test_a_damaged_message_is_reported_and_the_order_goes_on(site: Site) -> None:
+def test_a_damaged_message_is_reported_and_later_messages_are_read(site: Site) -> None:
     site.send(0, 1, 2, 3)
     address = message_address(site.segment, 2)
     site.segment.view(address, 1)[0] ^= 1

@@ -1,4 +1,4 @@
-"""Readers that are opened for a task: which kind for which mailbox, and reading on a grid."""
+"""Readers opened for a task: the kind for each mailbox, and reading on a grid."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Grid:
         return reading.verdict.name, reading.is_lost, reading.message.id
 
 
-def test_between_its_ticks_the_last_reading_stands(link: MakeLink) -> None:
+def test_the_last_reading_is_repeated_between_grid_ticks(link: MakeLink) -> None:
     rack = link()
     grid = Grid(rack, every=3, phase=1)
     assert grid.read(0)[:2] == ("NONE", False)
@@ -63,7 +63,7 @@ def test_between_its_ticks_the_last_reading_stands(link: MakeLink) -> None:
     ]
 
 
-def test_a_loss_shows_between_its_ticks_too(link: MakeLink) -> None:
+def test_a_lost_writer_is_reported_between_grid_ticks(link: MakeLink) -> None:
     rack = link()
     grid = Grid(rack, every=4, phase=0)
     for tick in range(9):

@@ -116,7 +116,7 @@ def test_a_finding_that_a_level_declares_has_its_name_value_and_unit(
 def test_a_finding_that_no_level_has_declared_is_damage(
     segment: Segment, owner: str, number: int
 ) -> None:
-    with pytest.raises(DamageError, match=f"{number} is not the number of a finding"):
+    with pytest.raises(DamageError, match=f"{number} is not the index of a finding"):
         heard(segment, owner, Alarm.OWN, number)
 
 

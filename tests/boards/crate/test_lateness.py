@@ -68,7 +68,7 @@ def test_a_level_that_crashes_in_every_first_cycle_has_skipped_all_and_fails_the
     again = [text for text in printed if "in the same place" in text]
     assert died - len(again) in (1, 2)  # the last one may not have been read
     assert again[1] == (
-        "board 'wave' failed in the same place, 2 more so far: RuntimeError: no cycle at all"
+        "board 'wave' failed again in the same place (2 repeats): RuntimeError: no cycle at all"
     )
 
 

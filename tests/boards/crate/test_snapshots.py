@@ -203,7 +203,7 @@ def test_restarts_before_a_snapshot_count_after_it(config: MakeConfig, crate: Wa
         ("file", "it holds /"),
         ("socket", "it holds socket:"),
         ("epoll", "it holds anon_inode:"),
-        ("thread", "it has the thread "),
+        ("thread", "it runs the thread "),
     ],
 )
 def test_a_level_that_cannot_be_copied_is_named_and_runs_as_before(

@@ -1,4 +1,4 @@
-"""A board's process: its name, and what its exit status says of its end."""
+"""A board's process: its name and its exit status."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def ended(segment: Segment, board: Callable[[Segment], int]) -> tuple[int, str]:
         (CannotGoOn("alone"), CANNOT_GO_ON, "board 'level': alone\n"),
     ],
 )
-def test_the_status_says_why_a_board_cannot_go_on(
+def test_the_exit_status_gives_the_reason_why_a_board_ended(
     make_bus: MakeBus, error: Exception, status: int, said: str
 ) -> None:
     assert ended(make_bus(task("level")), raising(error)) == (status, said)
@@ -68,7 +68,7 @@ def test_a_mistake_in_a_level_ends_its_board_with_a_traceback(make_bus: MakeBus)
 
 
 @pytest.mark.filterwarnings(FORKS)
-def test_a_board_that_ends_in_order_has_its_own_status_and_name(make_bus: MakeBus) -> None:
+def test_a_board_that_ends_regularly_has_its_exit_status_and_name(make_bus: MakeBus) -> None:
     def board(segment: Segment) -> int:
         os.write(2, Path("/proc/self/comm").read_bytes())
         return 7

@@ -1,4 +1,4 @@
-"""The guard of the clock: what it reports in which cycle, and what a restart leaves of it."""
+"""The clock guard: reports by cycle, and its state after a restart."""
 
 from __future__ import annotations
 

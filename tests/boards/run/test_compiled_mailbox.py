@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from rack.backplane.address_map import MAILBOX_HEAD_SIZE, slot_stride
 from rack.backplane.errors import MailboxError
 from rack.backplane.layout import Protocol
-from rack.backplane.mailbox.mailbox import Reader, ReadStatistics, Writer
+from rack.backplane.mailbox.mailbox import GOOD, Reader, ReadStatistics, Writer
 from rack.backplane.mailbox.slots import Slots, claim
 from rack.backplane.segment import Segment, unlink
 from rack.backplane.watch.alarms import AlarmWriter
@@ -153,7 +153,7 @@ class End:
             "alarms": [self._link.rung(name) for name in ("writer", "reader")],
             "seen": self._link.reader.seen,
             "results": self.results,
-            "reader": reader.words.tolist(),
+            "reader": reader.words[: GOOD // 8].tolist(),
             "good": bytes(reader.good[8 * (Slot.STAMP_NS + 1) :]),
             "statistics": [getattr(statistics, name) for name in ReadStatistics.__slots__],
             "troubles": self._link.reader.ports.task.troubles,

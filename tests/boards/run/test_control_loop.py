@@ -91,7 +91,8 @@ def test_a_damaged_message_shows_in_the_trace_of_its_reader(bench: MakeBench) ->
     wave.cycle(0)
     slots = Slots(rack.segment, rack.segment.layout.mailbox("wave.status"))
     assert slots.fetch(1)
-    slots.ring[:] = bytes(b ^ 0x80 for b in slots.ring)
+    for place in slots.places:
+        place[:] = bytes(b ^ 0x80 for b in place)
     rack.to(8)
     watch.cycle(8)
     rack.to(15)
@@ -102,7 +103,7 @@ def test_a_damaged_message_shows_in_the_trace_of_its_reader(bench: MakeBench) ->
     assert rack.segment.block("watch")[Block.CORRUPT] == 1
 
 
-def test_a_cut_off_access_shows_in_the_trace_and_the_cycle_continues(bench: MakeBench) -> None:
+def test_an_access_that_times_out_is_traced_and_the_cycle_continues(bench: MakeBench) -> None:
     rack = bench("protocol.mailbox={ 'wave.status' = 'lock' }")
     wave, watch = rack.task("wave"), rack.task("watch")
     wave.cycle(0)
@@ -210,7 +211,7 @@ def test_the_load_of_a_fault_is_computed_in_its_cycle(bench: MakeBench) -> None:
     assert entry.struck_tick == 0
 
 
-def test_a_finding_of_a_levels_own_is_one_alarm_an_episode(bench: MakeBench) -> None:
+def test_a_user_defined_finding_raises_one_alarm_per_episode(bench: MakeBench) -> None:
     breaks = [*range(30), 49, 70, 100]
     rack = bench("board.wave.executor=wave_levels:Surf", f"board.wave.params.breaks={breaks}")
     wave = rack.task("wave")

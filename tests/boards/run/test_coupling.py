@@ -26,7 +26,7 @@ def digest(rack: Rack) -> str:
         return rack.run(SECONDS).digest
 
 
-def test_tight_and_loose_write_the_same_in_lockstep(config: MakeConfig) -> None:
+def test_tight_and_loose_coupling_write_equal_messages_in_lockstep(config: MakeConfig) -> None:
     assert digest(Rack(config())) == digest(Rack(config(*LOOSE)))
 
 

@@ -77,7 +77,7 @@ def model(port: str) -> list[tuple[int, int]]:
 
 
 @pytest.mark.slow
-def test_ages_and_arrivals_are_those_of_the_configured_exchange_and_runs_repeat(
+def test_ages_and_arrivals_follow_the_configured_exchange_and_runs_repeat(
     config: MakeConfig,
 ) -> None:
     with Rack(config(text=TEXT)) as rack:
@@ -118,7 +118,7 @@ QUEUE = (
 
 
 @pytest.mark.slow
-def test_a_queue_is_emptied_at_every_exchange_and_its_writer_misses_nothing(
+def test_a_queue_is_emptied_at_every_exchange_without_refused_messages(
     config: MakeConfig,
 ) -> None:
     with Rack(config(*QUEUE, text=NO_TABLE)) as rack:

@@ -1,5 +1,4 @@
-"""Racks whose boards interrupt each other: what arrives, what is lost, what it costs, and that runs
-repeat."""
+"""Racks whose boards interrupt each other: messages lost, processor time, repeated runs."""
 
 from __future__ import annotations
 
@@ -136,7 +135,7 @@ def test_runs_with_a_full_inbox_and_killed_boards_repeat(
     assert first.cycle[-1].max() > TICKS - 10
 
 
-def test_messages_that_faults_strike_cost_the_same_on_every_run(config: MakeConfig) -> None:
+def test_faulty_messages_take_the_same_service_time_in_every_run(config: MakeConfig) -> None:
     faults = tuple(
         FaultConfig(kind=kind, board="figure3", tick=tick, cycles=10)  # type: ignore[arg-type]
         for kind, tick in (

@@ -79,7 +79,7 @@ def test_every_protocol_is_repeatable_in_lockstep(config: MakeConfig, protocol: 
 
 
 @pytest.mark.slow
-def test_one_mailbox_may_have_a_protocol_of_its_own(config: MakeConfig) -> None:
+def test_a_single_mailbox_may_have_a_different_protocol(config: MakeConfig) -> None:
     shared = "protocol.mailbox={ 'wave.plan' = 'double-buffer' }"
     time_slice, mixed = first_run(config)[1], written(Rack(config(shared)))
     again = written(Rack(config(shared)))

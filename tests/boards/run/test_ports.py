@@ -57,7 +57,7 @@ def test_a_slow_output_that_stops_is_mute_after_three_of_its_periods(link: MakeL
     assert 63 + 3 * 8 <= tick <= 63 + 4 * 8
 
 
-def test_a_forged_message_in_a_tasks_own_mailbox_is_reported_once_an_episode(
+def test_a_writer_reports_a_forged_message_once_per_episode(
     link: MakeLink,
 ) -> None:
     rack = link()

@@ -174,7 +174,7 @@ def test_order_and_fullness_depend_on_ticks_alone(
     assert runs[0] == runs[1]
 
 
-def test_a_full_queue_is_one_alarm_an_episode(link: MakeQueue) -> None:
+def test_a_full_queue_raises_one_alarm_per_episode(link: MakeQueue) -> None:
     rack = link(2)
     rack.reading.most = 0
     rack.run(0, 30, lambda tick: 1)
@@ -211,7 +211,7 @@ FOUND = {
 
 @pytest.mark.parametrize("kind", FOUND)
 @pytest.mark.parametrize("rates", [(1, 1), (1, 4), (4, 1)])
-def test_a_fault_of_messages_is_found_and_the_order_goes_on(
+def test_a_message_fault_is_detected_and_later_messages_are_read(
     link: MakeQueue, kind: str, rates: tuple[int, int]
 ) -> None:
     alarm, parameters = FOUND[kind]
@@ -230,9 +230,7 @@ def test_a_fault_of_messages_is_found_and_the_order_goes_on(
 
 
 @pytest.mark.parametrize("kind", ["mute", "reorder", "babble"])
-def test_a_fault_that_nothing_would_show_does_not_strike_a_queue(
-    link: MakeQueue, kind: str
-) -> None:
+def test_an_undetectable_fault_is_not_applied_to_a_queue(link: MakeQueue, kind: str) -> None:
     rack = link()
     entry = rack.fault(kind)
     rack.run(0, 8, lambda tick: 1)
@@ -243,7 +241,7 @@ def forge(rack: QueueLink, tick: int) -> None:
     assert exit_status(fork(lambda: messages.forge(rack.segment, NAME, tick))) == 0
 
 
-def test_a_forged_message_is_not_read_and_takes_no_ones_place(link: MakeQueue) -> None:
+def test_a_forged_message_is_not_read_and_displaces_no_message(link: MakeQueue) -> None:
     rack = link()
     rack.run(0, 4, lambda tick: 1)
     forge(rack, 4)

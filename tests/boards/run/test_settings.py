@@ -1,4 +1,4 @@
-"""What a level takes over of other settings, and what it keeps."""
+"""Settings that a level takes over, and state that it keeps."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def changed(level: Gauge, gain: float) -> None:
     change_settings(level, replace(level.context, params={"gain": gain}))
 
 
-def test_settings_are_taken_over_and_what_has_happened_stays(level: Gauge) -> None:
+def test_new_settings_take_effect_and_the_state_is_kept(level: Gauge) -> None:
     level.process(0)
     level.by_name["kept"] = 3.0
     changed(level, 4.0)
@@ -64,7 +64,7 @@ def test_settings_are_taken_over_and_what_has_happened_stays(level: Gauge) -> No
     assert level.context.params == {"gain": 4.0}
 
 
-def test_what_the_level_has_changed_itself_stays(level: Gauge) -> None:
+def test_attributes_that_the_level_has_changed_are_kept(level: Gauge) -> None:
     level.gain = 7.0
     level.table[0] = 9.0
     changed(level, 4.0)
@@ -72,7 +72,7 @@ def test_what_the_level_has_changed_itself_stays(level: Gauge) -> None:
     assert level.filter.gain == 4.0
 
 
-def test_what_was_none_becomes_an_object_unless_the_level_has_one(level: Gauge) -> None:
+def test_none_becomes_an_object_unless_the_level_has_created_one(level: Gauge) -> None:
     changed(level, 4.0)
     assert isinstance(level.reference, Filter)
     own = level.reference = Filter(8.0)

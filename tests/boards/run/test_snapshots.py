@@ -1,5 +1,4 @@
-"""When the clock takes snapshots: so that they cost a part of lockstep's time, each so many ticks,
-and before a tick that is asked for."""
+"""Times of snapshots: within a share of lockstep's time, periodically, and at a requested tick."""
 
 from __future__ import annotations
 
@@ -44,7 +43,7 @@ def copies_of(segment: Segment) -> tuple[ClockCopies, StubCopier]:
     return ClockCopies(segment, driver, copier), copier  # type: ignore[arg-type]
 
 
-def test_the_standstill_is_a_part_of_the_time(segment: Segment) -> None:
+def test_snapshots_take_a_limited_share_of_the_time(segment: Segment) -> None:
     segment.words[System.SNAPSHOT_PART] = PART
     copies, copier = copies_of(segment)
     started_s = time.monotonic()
@@ -62,7 +61,7 @@ def test_the_standstill_is_a_part_of_the_time(segment: Segment) -> None:
     assert copier.ticks[0] == 0
 
 
-def test_one_is_taken_each_so_many_ticks_and_before_the_tick_that_is_asked_for(
+def test_snapshots_are_taken_periodically_and_before_the_requested_tick(
     segment: Segment,
 ) -> None:
     segment.words[System.SNAPSHOT_EVERY] = 30
@@ -75,7 +74,7 @@ def test_one_is_taken_each_so_many_ticks_and_before_the_tick_that_is_asked_for(
     assert copier.ticks == [0, 30, 50, 80]
 
 
-def test_without_a_wish_none_is_taken(segment: Segment) -> None:
+def test_no_snapshot_is_taken_without_a_request(segment: Segment) -> None:
     copies, copier = copies_of(segment)
     assert min(copies(tick) for tick in range(50)) > 1 << 60
     assert copier.ticks == []

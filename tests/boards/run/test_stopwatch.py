@@ -1,4 +1,4 @@
-"""The stopwatch of a task: what it traces of a cycle, counts, and reports to the clock."""
+"""The stopwatch of a task: traces, counts, and reports to the clock."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ def test_a_cycle_beyond_its_deadline_is_missed_and_one_that_ends_with_it_is_not(
     assert (site.traced()["flags"], site.counts(Block.MISSED)) == (Flag.MISSED, [2])
 
 
-def test_skipped_releases_are_counted_and_stand_in_the_flags(site: Site) -> None:
+def test_skipped_releases_are_counted_and_recorded_in_the_flags(site: Site) -> None:
     site.cycle(1000, skipped=3)
     flags = site.traced()["flags"]
     assert (flags & 0xFFFF, flags >> SKIPPED_SHIFT) == (Flag.SKIPPED, 3)
@@ -175,7 +175,7 @@ def test_several_releases_given_at_once_are_reported_once(stepped: Site) -> None
         assert (stepped.counts(Block.DONE), done.value) == ([tick], reports)
 
 
-def test_in_real_time_nobody_waits_for_a_report(site: Site) -> None:
+def test_no_report_is_posted_in_real_time(site: Site) -> None:
     site.cycle(5)
     site.watch.idle()
     site.watch.notify_clock()
@@ -213,7 +213,7 @@ def test_failed_reads_are_counted_and_flagged_once(site: Site) -> None:
     assert site.counts(Block.CORRUPT, Block.BUS_ERRORS) == [3, 1]
 
 
-def test_traffic_is_counted_every_so_many_cycles(site: Site) -> None:
+def test_bus_counters_are_updated_periodically(site: Site) -> None:
     size = site.segment.layout.mailbox("level.status").size
     for tick in range(1000, 1000 + BUS_COUNT_CYCLES):
         site.inputs.read(tick)

@@ -1,5 +1,4 @@
-"""The system controller at a tick: boards that are lost and come back, and what it then demands of
-the arm."""
+"""The system controller at a tick: lost and restarted boards, and its demand on the arm."""
 
 from __future__ import annotations
 
@@ -204,7 +203,7 @@ def test_a_board_given_up_sets_the_latch_and_ends_the_run_after_the_arm_has_come
     assert rack.words[System.STOP_TICK] == 14
 
 
-def test_the_controller_rests_until_the_run_may_end_unless_it_has_work(make_bus: MakeBus) -> None:
+def test_the_next_work_tick_is_the_end_of_the_run_unless_there_is_work(make_bus: MakeBus) -> None:
     status = replace(box(TaskStatus, "task.status"), every=8, delay=8)
     bus = make_bus(*BOARDS, task("task", every=8, slot=4), status)
     rack = Controlled(bus, ends_run="task.status")
@@ -243,7 +242,7 @@ def test_a_run_lingers_after_its_task_has_ended(make_bus: MakeBus, state: State)
     assert found == [None] * 7 + [16] * 5
 
 
-def test_a_run_whose_task_goes_on_ends_once_its_level_is_silent(make_bus: MakeBus) -> None:
+def test_a_run_with_an_unfinished_task_ends_once_its_level_is_silent(make_bus: MakeBus) -> None:
     found = ends_at(make_bus(box(TaskStatus, "task.status"), task("task")), State.EXECUTING, 5, 60)
     # Heard as of tick 6; silent for 40 ticks as of 46, which is seen at 47.
     assert found == [None] * 47 + [56] * 13

@@ -1,4 +1,4 @@
-"""Small racks of every kind in lockstep: each leaves what it left before."""
+"""Small racks of every kind in lockstep run as recorded."""
 
 from __future__ import annotations
 
@@ -40,10 +40,12 @@ CASES: dict[str, tuple[str, tuple[str, ...]]] = {
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_a_small_rack_leaves_what_it_left_before(case: str, config: MakeConfig) -> None:
+def test_the_recorded_run_of_a_small_rack_is_unchanged(case: str, config: MakeConfig) -> None:
     text, settings = CASES[case]
     SNAPSHOTS.check(case, in_short(whole_run(config(*settings, text=text), SECONDS)))
 
 
-def test_a_rack_of_tables_leaves_what_it_left_before(config: MakeConfig, tmp_path: Path) -> None:
+def test_the_recorded_run_of_a_state_table_rack_is_unchanged(
+    config: MakeConfig, tmp_path: Path
+) -> None:
     SNAPSHOTS.check("tables", in_short(whole_run(config(text=counting(tmp_path)), SECONDS)))

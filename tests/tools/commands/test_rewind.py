@@ -172,7 +172,7 @@ def test_a_mistake_is_reported_in_one_line_with_the_usage(asked: Asked) -> None:
         f"goto -{DIGITS}": "must be 0 to 1.9975 s",
         f"events {DIGITS}": "must be 0 to 1e+09 s",
         f"branch --seconds {DIGITS}": "must be 0 to 1e+09 s",
-        f"branch --set seed={DIGITS}": "integer too long; permitted: 64 bits",
+        f"branch --set seed={DIGITS}": "integer too long: the limit is 64 bits",
         f"show wave.status.value[{DIGITS}]": "no such signal; nearest: wave.status.value",
         f"show wave.status.value[{12 * DIGITS}]": "wave.status.value[9",
         'goto --when "wave.status.valeu > 1"': "nearest: wave.status.value",
