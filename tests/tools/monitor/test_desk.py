@@ -201,7 +201,9 @@ def test_a_live_parameter_is_set_and_others_are_refused(running: str) -> None:
     for setting, line in {
         f"{params}.by=0": ".by = 0: should be greater than or equal to 1; counts in a cycle",
         f"{params}.bye=1": f"{params}.bye = 1: unknown key; did you mean 'by'?",
-        f"{params}.label='x'": f'{params}.label = "x": it is read at the launch only; live parameters: by',
+        f"{params}.label='x'": (
+            f'{params}.label = "x": it is read at the launch only; live parameters: by'
+        ),
         f"{params}.by": 'name = "by": must be key=value, as in bandwidth=80',
         "clock.speed=2": f"clock.speed=2: not a live parameter; valid keys: {params}.by",
     }.items():
